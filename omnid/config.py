@@ -13,7 +13,7 @@ from msgspec import Meta
 from drivers.logs.rotating_log import RotationSettings
 from drivers.logs.stamps import TimeSource
 from omnid.camera_config import CamerasConfig, PairConfig
-from omnid.controller.motor_settings import MotorSettings
+from omnid.controller.motor import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.settings import ScanSettings

@@ -23,18 +23,18 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
 from drivers.motors.protocols.motor_protocol import MotorProtocol, NoReplyError, T, Transaction
 
-CONNECT_TRY_S: Final = 0.2
+SET_UP_S: Final = 0.2  # time for the answer to the setting-up: an ODrive needs 0.1 s
 STOPS_AT_CLOSE: Final = 3  # tries
 READ_LIMIT_BYTES: Final = 4096
 POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
 FRESH_SHARE: Final = 0.5  # After a pause of this share of the watchdog's time it may expire before a command arrives.
-LONGEST_WAIT_S: Final = 5.0  # between two attempts to open the port
-HEARD_BYTES: Final = 40  # of what came instead of an answer
-_REASONS = {
+LONGEST_WAIT_S: Final = 2.0  # between two attempts to open the port, or to set up the controller
+_BUSY: Final = "it is in use by another program; see `fuser -v` with its name"
+_REASONS: Final = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
     errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",
-    errno.EBUSY: "it is in use by another program; see `fuser -v` with its name",
-    errno.EAGAIN: "it is in use by another program; see `fuser -v` with its name",
+    errno.EBUSY: _BUSY,
+    errno.EAGAIN: _BUSY,
 }
 
 
@@ -45,13 +45,13 @@ class LateReplyError(NoReplyError):
 class _State(Enum):
     """What the next command finds, and what it becomes by an answer.
 
-    | state      | next command                                   | answer                                 |
-    |------------|------------------------------------------------|----------------------------------------|
-    | GONE       | open the port, then as SETTING_UP              |                                        |
-    | SETTING_UP | set the watchdog, or await that; as STOP_FIRST |                                        |
-    | STOP_FIRST | a stop in its place                            | DRIVING; STOP_FIRST where it expired   |
-    | SILENT     | a stop in its place                            | SETTING_UP: it may have lost its power |
-    | DRIVING    | the command                                    | DRIVING; STOP_FIRST where it expired   |
+    | state      | next command                     | answer                                 |
+    |------------|----------------------------------|----------------------------------------|
+    | GONE       | open the port, then SETTING_UP   |                                        |
+    | SETTING_UP | set the watchdog, then STOP_FIRST|                                        |
+    | STOP_FIRST | a stop in its place              | DRIVING; STOP_FIRST where it expired   |
+    | SILENT     | a stop in its place              | SETTING_UP: it may have lost its power |
+    | DRIVING    | the command                      | DRIVING; STOP_FIRST where it expired   |
 
     No answer, or a pause in which the watchdog may expire: SILENT. A rejected command: STOP_FIRST. A lost port: GONE.
     """
@@ -66,17 +66,17 @@ class _State(Enum):
 class SerialMotor:
     """The base on a serial port, locked for this program.
 
-    `send` blocks for at most timeout_s, twice that where the controller is set up, plus the time to open the port where
-    it was gone; `close` for STOPS_AT_CLOSE times timeout_s. A command is sent once and never repeated: the caller sends
-    the next one at its own rate.
+    `send` blocks for at most timeout_s, SET_UP_S more where the controller is set up, plus the time to open the port
+    where it was gone; `close` for STOPS_AT_CLOSE times timeout_s. A command is sent once and never repeated: the caller
+    sends the next one at its own rate.
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
     status with watchdog_expired; the command after it drives. After a missing reply and a pause the controller is
     set up again once a stop has got a reply, because it may have been switched off and on, and another stop
-    follows. A port that is gone is opened again by a later `send`, with growing waits, during which `send` fails at
-    once. A port that is there stays open, and its controller is asked until it answers: some boards start again when
-    their port is opened, and boot for seconds.
+    follows. A port that is gone is opened, and a controller without an answer is set up by a later `send`, with growing
+    waits, during which `send` fails at once. A port that is there stays open: some boards start again when their port
+    is opened, and boot for seconds.
     """
 
     def __init__(
@@ -106,14 +106,15 @@ class SerialMotor:
         self._state = _State.GONE
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
-        self._reopening, self._next_open_s = Backoff(LONGEST_WAIT_S), -math.inf
-        self._asking: Transaction[float] | None = None  # of the setting-up, while its answer is awaited
-        self._ask_again_s = -math.inf
-        self._came = b""  # the first bytes since a question was asked
-        self._problem = ""
+        self._waits, self._next_try_s = Backoff(LONGEST_WAIT_S), -math.inf
+        self._problem = ""  # why the last try failed
         next(self._protocol.connect(watchdog_ms))  # what no controller can be asked for is an error at once
         if connect_s:
-            self._connect(connect_s)
+            try:
+                self._connect(time.monotonic() + connect_s)
+            except BaseException:
+                self._release()
+                raise
 
     def send(self, command: VelocityCommand) -> MotorStatus:
         """Send a command and return the controller's status.
@@ -123,7 +124,9 @@ class SerialMotor:
         """
         before = self._state
         try:
-            return self._send(command, time.monotonic() + self._timeout_s)
+            if before in (_State.GONE, _State.SETTING_UP):
+                self._try_again()
+            return self._send(command)
         except DriverError as error:
             self.errors += 1
             is_silent = isinstance(error, NoReplyError)
@@ -139,28 +142,56 @@ class SerialMotor:
         self._closed = True
         with contextlib.suppress(DriverError):
             for _ in range(STOPS_AT_CLOSE if self._port is not None else 0):
-                stop = self._protocol.drive(stop_command(0), time.monotonic())
                 with contextlib.suppress(NoReplyError):
-                    self._run(stop, time.monotonic() + self._timeout_s)
+                    self._run(self._protocol.drive(stop_command(0)), self._timeout_s)
                     break
         self._release()
 
-    def _send(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
-        # 1. Open the port and set up the controller where that is to be done.
-        is_new = self._state in (_State.GONE, _State.SETTING_UP)
+    def _connect(self, deadline_s: float) -> None:
+        """Open the port and send stops until one gets a reply; raise DriverError after the deadline."""
+        while self._state is not _State.DRIVING:
+            is_over = time.monotonic() >= deadline_s
+            try:
+                if self._state in (_State.GONE, _State.SETTING_UP):
+                    self._set_up()
+                self._send(stop_command(0))
+            except NoReplyError:
+                if is_over:
+                    raise
+            if is_over and self._state is _State.STOP_FIRST:
+                raise DriverError(f"motor on {self._name} stays stopped by its watchdog; switch it off and on again")
+
+    def _try_again(self) -> None:
+        """Set up the controller, unless the last try failed just now; raise DriverError then, and where it fails."""
+        if self._closed:
+            raise DriverError(f"motor on {self._name} is closed; make a new one")
+        if time.monotonic() < self._next_try_s:
+            raise DriverError(self._problem)
+        try:
+            self._set_up()
+        except DriverError as error:
+            self._problem, self._next_try_s = str(error), time.monotonic() + self._waits.next_s()
+            raise
+        self._waits.reset()
+
+    def _set_up(self) -> None:
+        """Open the port if it is gone, and set the controller's watchdog."""
         if self._state is _State.GONE:
-            self._open()
-        if is_new:
-            self._set_up(deadline_s)
-            deadline_s = max(deadline_s, time.monotonic() + self._timeout_s)
-        # 2. Send the command, or a stop in its place.
+            self._port, self._state = _opened(self._name, self._baud), _State.SETTING_UP
+        in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), max(SET_UP_S, self._timeout_s))
+        self._fresh_s = FRESH_SHARE * in_force_ms / 1000
+        self._state = _State.STOP_FIRST
+        self.connections += 1
+
+    def _send(self, command: VelocityCommand) -> MotorStatus:
+        # 1. Send the command, or a stop in its place.
         now_s = _clock_s()
-        if not is_new and now_s - self._last_sent_s > self._fresh_s:
+        if self._state is _State.DRIVING and now_s - self._last_sent_s > self._fresh_s:
             self._state = _State.SILENT
         stopping = self._state is not _State.DRIVING
         sent = stop_command(command.stamp_ns) if stopping else command
-        status = self._run(self._protocol.drive(sent, now_s), deadline_s)
-        # 3. What the answer says of the next command.
+        status = self._run(self._protocol.drive(sent), self._timeout_s)
+        # 2. What the answer says of the next command.
         self._last_sent_s = now_s
         if self._state is _State.SILENT:
             self._state = _State.SETTING_UP
@@ -171,101 +202,37 @@ class SerialMotor:
         self.replaced_by_stop += 1
         return replace(status, watchdog_expired=True)
 
-    def _connect(self, connect_s: float) -> None:
-        """Open the port and send stops until one gets a reply; raise DriverError after connect_s."""
-        deadline_s = time.monotonic() + connect_s
-        try:
-            while self._state is not _State.DRIVING:
-                try:
-                    self._send(stop_command(0), time.monotonic() + 2 * max(CONNECT_TRY_S, self._timeout_s))
-                except NoReplyError:
-                    if time.monotonic() >= deadline_s:
-                        raise
-                    continue
-                if self._state is _State.STOP_FIRST and time.monotonic() >= deadline_s:
-                    raise DriverError(
-                        f"motor on {self._name} stays stopped by its watchdog; switch it off and on again"
-                    )
-        except BaseException:
-            self._release()
-            raise
-
-    def _set_up(self, deadline_s: float) -> None:
-        """Ask the controller to be set up, or go on to await its answer; ask again after CONNECT_TRY_S."""
-        now_s = time.monotonic()
-        if self._asking is None or now_s >= self._ask_again_s:
-            self._asking = None
-            self._ask_again_s = now_s + max(CONNECT_TRY_S, self._timeout_s)
-            self._asking = self._begun(self._protocol.connect(self._watchdog_ms))
-        asking, is_over = self._asking, deadline_s >= self._ask_again_s
-        try:
-            in_force_ms = self._result(asking, min(deadline_s, self._ask_again_s), is_over=is_over)
-        except NoReplyError as error:
-            self._problem = str(error) if is_over else self._problem
-            raise NoReplyError(self._problem or f"motor on {self._name} has not answered yet") from None
-        except DriverError:
-            self._asking = None
-            raise
-        self._asking, self._problem = None, ""
-        self._fresh_s = FRESH_SHARE * in_force_ms / 1000
-        self._state = _State.STOP_FIRST
-        self._reopening.reset()
-        self.connections += 1
-
-    def _open(self) -> None:
-        """Open the port; raise DriverError before the time of the next try, and where it cannot be opened."""
-        if self._closed:
-            raise DriverError(f"motor on {self._name} is closed; make a new one")
-        if time.monotonic() < self._next_open_s:
-            raise DriverError(self._problem or f"motor on {self._name} is gone; plug it in, it is tried again")
-        self._next_open_s, self._problem = time.monotonic() + self._reopening.next_s(), ""
-        try:
-            self._port, self._state = _opened(self._name, self._baud), _State.SETTING_UP
-        except DriverError as error:
-            self._problem = str(error)
-            raise
-
     def _release(self) -> None:
-        port, self._port, self._state, self._asking = self._port, None, _State.GONE, None
+        port, self._port, self._state = self._port, None, _State.GONE
         if port is not None:
             with contextlib.suppress(OSError, termios.error):
                 fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
             with contextlib.suppress(OSError, termios.error):
                 port.close()
 
-    def _run(self, transaction: Transaction[T], deadline_s: float) -> T:
-        """Run a transaction and return its result; NoReplyError after the deadline."""
-        return self._result(self._begun(transaction), deadline_s)
+    def _run(self, transaction: Transaction[T], timeout_s: float) -> T:
+        """Discard replies to earlier commands, run a transaction, and return its result; NoReplyError after timeout_s.
 
-    def _begun(self, transaction: Transaction[T]) -> Transaction[T]:
-        """Discard replies to earlier commands, and send the first bytes of a transaction."""
-        self._framer.reset()
-        self._came = b""
-        with self._on_port():
-            if self._port is not None:
-                self._port.reset_input_buffer()
-            self._write(next(transaction))
-        return transaction
-
-    def _result(self, transaction: Transaction[T], deadline_s: float, *, is_over: bool = True) -> T:
-        """Return the result of a transaction that has begun; is_over: after the deadline it is given up.
-
-        Raises NoReplyError after the deadline. The input is read once more after it, since a thread that was delayed
-        may find a reply waiting that came in time.
+        The input is read once more after that, since a thread that was delayed may find a reply waiting that came in
+        time.
         """
+        deadline_s = time.monotonic() + timeout_s
+        self._framer.reset()
         try:
-            overdue = False
-            while not overdue:
-                overdue = time.monotonic() >= deadline_s
-                with self._on_port():
-                    data = self._read(deadline_s)
-                    self._came = (self._came + data)[:HEARD_BYTES]
-                    for frame in self._framer.feed(data):
+            with self._on_port():
+                if self._port is not None:
+                    self._port.reset_input_buffer()
+                self._write(next(transaction))
+                overdue = False
+                while not overdue:
+                    overdue = time.monotonic() >= deadline_s
+                    for frame in self._framer.feed(self._read(deadline_s)):
                         self._write(transaction.send(frame))
+                advice = f"check power, cable, the baud rate ({self._baud}, motor.baud) and motor.protocol"
+                raise NoReplyError(f"gave no answer of its protocol; {advice}")
         except StopIteration as done:
             result: T = done.value
             return result
-        raise self._no_reply() if is_over else NoReplyError(f"motor on {self._name} has not answered yet")
 
     @contextlib.contextmanager
     def _on_port(self) -> Iterator[None]:
@@ -302,12 +269,6 @@ class SerialMotor:
                 return b""
             time.sleep(min(left_s, POLL_PERIOD_S))
         return os.read(self._port.fileno(), READ_LIMIT_BYTES)
-
-    def _no_reply(self) -> NoReplyError:
-        """Return the error for a missing reply, with what came instead."""
-        found = f"answers, but not in its protocol: {self._came!r}" if self._came else "gave no answer, not a byte"
-        advice = f"check power, cable, the baud rate ({self._baud}, motor.baud) and motor.protocol"
-        return NoReplyError(f"motor on {self._name} {found}; {advice}")
 
 
 def _opened(port: str, baud: int) -> serial.Serial:

@@ -12,7 +12,7 @@ import socket
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
-from omnid.controller.motor_settings import MotorSettings
+from omnid.controller.motor import MotorSettings
 from omnid.core.control.contacts import NO_CONTACT, ContactState
 from omnid.core.control.control_law import ControlInput, ControllerSettings
 from omnid.engine.realtime import RealtimeSettings

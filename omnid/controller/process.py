@@ -96,7 +96,7 @@ def run_controller(channel: Channel) -> int:
             start.controller,
             1.0 / start.motor.rate_hz,
             lambda text: channel.send(LogRecord(text)),
-            limited=start.motor.drive.geometry().limited,
+            limited=start.motor.drive.limited,
             boot_s=None if start.waits else start.motor.boot_s,
         )
         ControllerLoop(channel, controller).run()

@@ -24,8 +24,7 @@ from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.config import RecordConfig
-from omnid.controller.motor import SIMULATED
-from omnid.controller.motor_settings import MotorSettings
+from omnid.controller.motor import SIMULATED, MotorSettings
 from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked

@@ -13,10 +13,10 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import NoReplyError
 from drivers.motors.serial_motor import LateReplyError
-from omnid.controller.motor import open_motor
-from omnid.controller.motor_settings import DriveSettings, MotorSettings
+from omnid.controller.motor import MotorSettings, open_motor
 from omnid.errors import OmnidError
 
 MOVE_S, REST_S = 1.0, 0.3  # duration of a motion in each direction, and of the rest after it
@@ -43,7 +43,7 @@ def tested_drive(
     turns: float,
     move_s: float = MOVE_S,
     rest_s: float = REST_S,
-) -> DriveSettings:
+) -> DifferentialDrive:
     """Turn the wheels, ask what they did, and return the settings of the drive as the wiring is.
 
     ask: prints a question, returns the answer. speed_mps: of a wheel. turns: of each wheel, for the scale; 0: leave

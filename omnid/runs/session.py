@@ -64,7 +64,7 @@ def joint_wheels(config: Config) -> JointWheels | None:
         return None
     if len(joints) != 2 or len(set(joints)) != 2:
         raise OmnidError(f"motion.wheel_joints = {list(joints)}: expected the names of two joints, or none")
-    drive = config.motor.drive.geometry()
+    drive = config.motor.drive
     return JointWheels(*joints, drive.wheel_radius_m, drive.track_m)
 
 

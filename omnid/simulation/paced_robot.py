@@ -18,7 +18,7 @@ from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Frame
 from drivers.motion import GyroSample, MotionSample
 from drivers.motor import VelocityCommand
-from drivers.motors.simulated.simulated_base import Pose
+from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
 from omnid.controller.link import ControllerStatistics, DriveLink
 from omnid.controller.statistics import TickReport

@@ -11,7 +11,7 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from drivers.motors.simulated.simulated_base import MotionLimits
+from drivers.motors.simulated_motor import MotionLimits
 from omnid.simulation.rendering.sensor import Sensor
 
 CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.

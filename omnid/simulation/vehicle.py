@@ -24,8 +24,7 @@ from calib.rig import Rig
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
-from drivers.motors.simulated.simulated_base import Pose
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
+from drivers.motors.simulated_motor import Pose, SimulatedMotor
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
@@ -117,7 +116,7 @@ class Vehicle:
         self.now_ns = self._start_ns = self._tick_ns = self._gyro_ns = start_ns
         self._take_tick = take_tick
         self.cameras = self.make_cameras(with_masks(robot.rig), robot.sensor, world, seed, robot.samples)
-        drive = config.motor.drive.geometry()
+        drive = config.motor.drive
         self.motor = SimulatedMotor(drive, config.motor.watchdog_ms, lambda: self.now_ns)
         self.base = self.motor.base
         self.base.pose, self.base.limits, self.base.traction = world.start, robot.limits, self.travel_m

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib import se3
 from calib.models.camera import Array
-from drivers.motors.simulated.simulated_base import Pose
+from drivers.motors.simulated_motor import Pose
 from omnid.simulation.rendering.surfaces import Rectangle
 
 Point = tuple[float, float]

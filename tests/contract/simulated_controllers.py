@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 import select
@@ -15,7 +16,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final, Protocol
 
+from drivers.motor import VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.line_protocol import BUMPER, CLIFF, SEQ_COUNT, decode, encode
 from drivers.motors.protocols.motor_protocol import Framer, T, TextFramer, Transaction
 from drivers.motors.protocols.odrive_ascii import CLOSED_LOOP, WATCHDOG_EXPIRED, with_checksum
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
@@ -29,22 +32,43 @@ from drivers.motors.protocols.vesc import (
     packet,
 )
 from drivers.motors.serial_motor import SerialMotor
-from drivers.motors.simulated.simulated_base import (
-    LEFT,
-    RIGHT,
-    SIDES,
-    STEP_S,
-    SimulatedBase,
-    SimulatedFirmware,
-)
-from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated_motor import LEFT, RIGHT, SIDES, STEP_S, SimulatedBase
+
+
+class FirmwareBase(SimulatedBase):
+    """Wheels that need a stop after their watchdog has expired, and count what a controller receives."""
+
+    def __init__(self, drive: DifferentialDrive | None = None) -> None:
+        super().__init__(drive)
+        self.commands = self.errors = 0  # valid commands, and all that a real controller would reject
+        self.expiries = 0  # times that the watchdog has stopped the wheels
+        self.unsafe_resumes = 0  # motion commands to a wheel that needed a stop first
+        self._needs_stop = [False, False]
+
+    @property
+    def last_command(self) -> VelocityCommand:
+        """The last commanded motion, with stamp and heading 0."""
+        left_mps, right_mps = self.commanded_mps
+        return VelocityCommand(0, (left_mps + right_mps) / 2, 0.0, (right_mps - left_mps) / self.drive.track_m)
+
+    def command_wheel(self, side: int, speed_mps: float) -> None:
+        is_unsafe = self._needs_stop[side] and speed_mps != 0.0
+        self.unsafe_resumes += is_unsafe
+        self.errors += is_unsafe
+        self._needs_stop[side] = False
+        super().command_wheel(side, speed_mps)
+
+    def expire(self, side: int) -> None:
+        self.expiries += not self.watchdog_expired
+        self._needs_stop[side] = True
+        super().expire(side)
 
 
 class SimulatedController(Protocol):
     """Simulated firmware: receives and sends bytes, and turns the wheels. Invalid frames are counted as errors."""
 
     @property
-    def base(self) -> SimulatedBase:
+    def base(self) -> FirmwareBase:
         """The simulated base."""
 
     def feed(self, data: bytes) -> bytes:
@@ -68,11 +92,73 @@ def channels_mps(base: SimulatedBase) -> tuple[float, float]:
     return base.drive.to_channels(base.velocity_mps - half_mps, base.velocity_mps + half_mps)
 
 
+class SimulatedFirmware:
+    """Simulated firmware of one kind of controller: handles frames, and turns the wheels of its base."""
+
+    def __init__(self, drive: DifferentialDrive | None, framer: Framer) -> None:
+        self.base, self._framer = FirmwareBase(drive), framer
+
+    def feed(self, data: bytes) -> bytes:
+        """Return the replies to all frames that end in data."""
+        return b"".join(self.handle(frame) for frame in self._framer.feed(data))
+
+    def handle(self, frame: bytes) -> bytes:
+        """Return the reply to a frame, empty without one."""
+        raise NotImplementedError
+
+    def _reject(self, reply: bytes) -> bytes:
+        """Count an error and return the reply to it."""
+        self.base.errors += 1
+        return reply
+
+
+class SimulatedLine(SimulatedFirmware):
+    """Own firmware; heading_input: steer to the commanded heading, else follow the commanded yaw rate."""
+
+    def __init__(self, drive: DifferentialDrive | None = None, *, heading_input: bool = True) -> None:
+        super().__init__(drive, TextFramer())
+        self._heading_input = heading_input
+        self._zero_rad = 0.0  # heading in the world at which the controller's heading is 0
+        self._next_seq: int | None = None
+
+    def handle(self, frame: bytes) -> bytes:
+        """Return the reply to a frame, empty without one."""
+        kind, numbers = decode(frame) or ("", ())
+        if kind == "V":
+            return self._drive(*numbers)
+        if kind != "W":
+            return self._reject(b"")
+        # A connection: stop, count the present heading as 0, accept any seq as the first one.
+        self.base.watchdog_ms = numbers[0]
+        self._next_seq, self._zero_rad = None, self.base.pose[2]
+        self.base.command(0.0, 0.0)
+        return encode("A", numbers[0])
+
+    def _drive(self, seq: int, velocity: int, heading: int, yaw_rate: int) -> bytes:
+        base = self.base
+        base.errors += self._next_seq not in (None, seq)
+        self._next_seq = (seq + 1) % SEQ_COUNT
+        base.commands += 1
+        turned_rad = math.remainder(base.pose[2] - self._zero_rad, math.tau)
+        measured = (round(value * 1000) for value in (base.velocity_mps, turned_rad, base.yaw_rate_radps))
+        contact = BUMPER * base.bumper + CLIFF * base.cliff
+        state = round(base.battery_v * 1000), base.fault, int(self.is_expired()), contact
+        reply = encode("S", seq, *measured, *state)
+        steers = self._heading_input and (velocity or yaw_rate)
+        base.goal_heading_rad = heading / 1000 + self._zero_rad if steers else None
+        base.command(velocity / 1000, yaw_rate / 1000)
+        return reply
+
+    def is_expired(self) -> bool:
+        """True if the watchdog has stopped the wheels."""
+        return self.base.watchdog_expired
+
+
 class SimulatedRoboteq(SimulatedFirmware):
     """One controller; by default it echoes, as a real one does."""
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
-        super().__init__(SimulatedBase(drive), TextFramer())
+        super().__init__(drive, TextFramer())
         self.base.watchdog_ms = 1000
         self._echo = True
 
@@ -113,7 +199,7 @@ class SimulatedODrive(SimulatedFirmware):
     """One board. It requires a checksum on every line, which is optional for a real one, to detect damaged lines."""
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
-        super().__init__(SimulatedBase(drive), TextFramer())
+        super().__init__(drive, TextFramer())
         self.base.watchdog_ms = 0
         self._state = [_IDLE, _IDLE]
         self._input_vel = [0.0, 0.0]  # turns/s; set while an axis is disarmed too, in force once it is armed
@@ -195,7 +281,7 @@ class SimulatedVesc(SimulatedFirmware):
     """A pair of controllers; timeout_ms: of both, as set by VESC Tool."""
 
     def __init__(self, drive: DifferentialDrive | None = None, timeout_ms: int = 500) -> None:
-        super().__init__(SimulatedBase(drive), PacketFramer())
+        super().__init__(drive, PacketFramer())
         self.base.watchdog_ms = timeout_ms
 
     def handle(self, frame: bytes) -> bytes:
@@ -272,7 +358,7 @@ class PtyMotor:
         self._thread.start()
 
     @property
-    def base(self) -> SimulatedBase:
+    def base(self) -> FirmwareBase:
         """The simulated base."""
         return self.controller.base
 
@@ -307,7 +393,8 @@ class PtyMotor:
             if self._wake_read in readable:
                 return
             if self._expiring.is_set():
-                self.base.expire()
+                for side in SIDES:
+                    self.base.expire(side)
                 self._expiring.clear()
             if readable:
                 self._receive(os.read(self._device, READ_LIMIT_BYTES))

@@ -49,18 +49,16 @@ class Connection:
         self.controller: SimulatedController = controller_of(name, drive)
         self.base = self.controller.base
         self.framer: Framer = self.protocol.framer()
-        self.now_s = 0.0
         run(self.protocol.connect(LONG_MS), self.controller, self.framer)
         self.send(stop_command(0))
 
     def send(self, command: VelocityCommand) -> MotorStatus:
-        return run(self.protocol.drive(command, self.now_s), self.controller, self.framer)
+        return run(self.protocol.drive(command), self.controller, self.framer)
 
     def drive(self, seconds: float, velocity_mps: float, yaw_rate_radps: float) -> MotorStatus:
         for _ in range(round(seconds / 0.05)):
             status = self.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
             self.base.advance(0.05)
-            self.now_s += 0.05
         return status
 
 
@@ -95,7 +93,7 @@ def test_limiting_the_wheel_speed_keeps_the_curvature(name: str, velocity_mps: f
 def test_refuses_numbers_that_are_not_finite(name: str, bad: float, field: str) -> None:
     command = replace(VelocityCommand(0, 0.1, 0.1, 0.1), **{field: bad})
     with pytest.raises(DriverError, match="only finite"):
-        next(PROTOCOLS[name](BASE).drive(command, 0.0))
+        next(PROTOCOLS[name](BASE).drive(command))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -103,7 +101,7 @@ def test_host_accepts_any_bytes(name: str) -> None:
     """No bytes raise anything but DriverError."""
     rng, protocol = random.Random(11), PROTOCOLS[name](BASE)
     for noise in noises(rng, replies_of(name)):
-        for transaction in (protocol.connect(LONG_MS), protocol.drive(stop_command(0), rng.random())):
+        for transaction in (protocol.connect(LONG_MS), protocol.drive(stop_command(0))):
             framer = protocol.framer()
             next(transaction)
             with contextlib.suppress(DriverError, StopIteration):
@@ -127,7 +125,7 @@ def test_noise_without_end_needs_bounded_memory(name: str) -> None:
 def replies_of(name: str) -> bytes:
     """Return the replies of the simulated controller to a stop."""
     connection = Connection(name)
-    return connection.controller.feed(next(connection.protocol.drive(stop_command(0), 1.0)))
+    return connection.controller.feed(next(connection.protocol.drive(stop_command(0))))
 
 
 def noises(rng: random.Random, valid: bytes) -> Iterator[bytes]:

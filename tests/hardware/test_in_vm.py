@@ -21,10 +21,9 @@ from calib.rig_file import rig_toml
 from drivers.cameras.log_camera import LogImages
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
-from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.runs.session import attached_rig
 from omnid.stages.geometry import with_rims
-from tests.contract.simulated_controllers import LONGEST_ABSENCE_S
+from tests.contract.simulated_controllers import LONGEST_ABSENCE_S, SimulatedLine
 from tests.hardware.image import ROOT, ImageUnavailableError, image
 from tests.hardware.machine import Result, names_in, run_tests
 

@@ -18,10 +18,9 @@ from typing import Any, NamedTuple
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.transport import codec
 from omnid.transport.codec import Pose
-from tests.contract.simulated_controllers import PtyMotor
+from tests.contract.simulated_controllers import PtyMotor, SimulatedLine
 from tests.ports import free_port
 from tests.waiting import ended, wait_until
 

@@ -14,7 +14,7 @@ import numpy as np
 from calib import se3
 from calib.models.camera import Array
 from drivers.frame import Camera, Frame
-from drivers.motors.simulated.simulated_base import Pose
+from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
 from omnid.simulation import lockstep
 from omnid.simulation.lockstep import Drive, SimulatedRun

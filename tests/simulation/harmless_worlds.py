@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from calib.models.camera import Array
-from drivers.motors.simulated.simulated_base import Pose
+from drivers.motors.simulated_motor import Pose
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.surfaces import Point, Rectangle

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
@@ -11,20 +14,21 @@ from drivers.motor import VelocityCommand
 
 @dataclass(frozen=True, slots=True)
 class DifferentialDrive:
-    """Geometry and wiring. A controller's channels are its motors in its own order and sense of rotation.
+    """Geometry and wiring. A controller's channels are its motors in its own order and sense of rotation."""
 
-    For a base that skids (four wheels, tracks) the effective track is needed: the one that fits measured turns.
-    """
-
-    track_m: float = 0.3  # distance between the left and the right wheels
-    wheel_radius_m: float = 0.05
-    max_wheel_mps: float = 1.0  # limit of every wheel speed command
-    gear: float = 1.0  # turns of the motor per turn of the wheel
-    pole_pairs: int = 7  # of the motor
-    reverse_left: bool = False
-    reverse_right: bool = False
-    swapped: bool = False  # channel 1 is the right wheel
-    can_id: int = 1  # of the controller of channel 2, where each motor has its own
+    track_m: Annotated[
+        float,
+        Meta(ge=0.01, le=10),
+        "distance of the left and the right wheels, m; where they skid: the one that makes measured turns right",
+    ] = 0.3
+    wheel_radius_m: Annotated[float, Meta(ge=0.001, le=5), "radius of the wheels, m"] = 0.05
+    max_wheel_mps: Annotated[float, Meta(ge=0.001, le=20), "highest speed of a wheel, m/s"] = 1.0
+    gear: Annotated[float, Meta(ge=0.001, le=10_000), "turns of the motor per turn of the wheel"] = 1.0
+    pole_pairs: Annotated[int, Meta(ge=1, le=100), "vesc: pole pairs of the motor"] = 7
+    reverse_left: Annotated[bool, "the left motor turns the other way round"] = False
+    reverse_right: Annotated[bool, "the right motor turns the other way round"] = False
+    swapped: Annotated[bool, "the motor controller's first motor is the right one"] = False
+    can_id: Annotated[int, Meta(ge=0, le=253), "vesc: id of the second motor's controller"] = 1
 
     @property
     def turns_per_m(self) -> float:
@@ -42,7 +46,8 @@ class DifferentialDrive:
         max_wheel_mps: limit of the protocol, besides the one of this drive. Raises DriverError for numbers that are
         not finite.
         """
-        _require_finite(command)
+        if not all(map(math.isfinite, (command.velocity_mps, command.yaw_rate_radps, command.heading_rad))):
+            raise DriverError(f"{command}: only finite numbers can be sent, send a stop instead")
         fastest_mps = abs(command.velocity_mps) + abs(command.yaw_rate_radps) * self.track_m / 2
         scale = min(1.0, min(self.max_wheel_mps, max_wheel_mps) / fastest_mps) if fastest_mps > 0.0 else 1.0
         return command.velocity_mps * scale, command.yaw_rate_radps * scale
@@ -67,10 +72,3 @@ class DifferentialDrive:
         """Return the values of the channels from those of the wheels: the inverse of `to_sides`."""
         left, right = -left if self.reverse_left else left, -right if self.reverse_right else right
         return (right, left) if self.swapped else (left, right)
-
-
-def _require_finite(command: VelocityCommand) -> None:
-    named = (("velocity", command.velocity_mps), ("yaw rate", command.yaw_rate_radps), ("heading", command.heading_rad))
-    for name, value in named:
-        if not math.isfinite(value):
-            raise DriverError(f"motor {name} is {value}; only finite numbers can be sent, send a stop instead")

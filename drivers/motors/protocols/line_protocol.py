@@ -37,128 +37,63 @@ from __future__ import annotations
 import binascii
 import math
 import re
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
 
-SEQ_COUNT = 65536
-MAX_LINE = 64  # bytes
-_LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")
-_BUMPER, _CLIFF = 1, 2  # bits of the contact
+SEQ_COUNT: Final = 65536
+_LINE: Final = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")
+BUMPER, CLIFF = 1, 2  # bits of the contact
 
-
-class _Field(NamedTuple):
-    """A number of a line with its range."""
-
-    name: str
-    unit: str
-    low: int
-    high: int
-
-
+# Name, lowest and highest number of the fields of each kind of line, as in the table above.
 _MOTION: Final = (
-    _Field("seq", "(a count)", 0, SEQ_COUNT - 1),
-    _Field("velocity", "mm/s", -10_000, 10_000),
-    _Field("heading", "mrad", -3142, 3142),
-    _Field("yaw rate", "mrad/s", -20_000, 20_000),
+    ("seq", 0, SEQ_COUNT - 1),
+    ("velocity", -10_000, 10_000),
+    ("heading", -3142, 3142),
+    ("yaw rate", -20_000, 20_000),
 )
-_STATE: Final = (
-    _Field("battery", "mV", -1, 100_000),
-    _Field("fault", "(a number)", 0, 65535),
-    _Field("expired", "(a flag)", 0, 1),
-    _Field("contact", "(two bits)", 0, _BUMPER | _CLIFF),
-)
-_TIME: Final = (_Field("watchdog time", "ms", 20, 10_000),)
+_STATE: Final = (("battery", -1, 100_000), ("fault", 0, 65535), ("expired", 0, 1), ("contact", 0, BUMPER | CLIFF))
+_TIME: Final = (("watchdog time", 20, 10_000),)
 _FIELDS: Final = {"V": _MOTION, "S": (*_MOTION, *_STATE), "W": _TIME, "A": _TIME}
 
 
-class ProtocolError(DriverError):
-    """A line that does not match the grammar, or a number that is out of its range."""
-
-
 def encode(kind: str, *numbers: int) -> bytes:
-    """Return the line of a kind (V, S, W or A) with its numbers; raise ProtocolError for one out of its range.
+    """Return the line of a kind (V, S, W or A) with its numbers; raise DriverError for one out of its range.
 
     A contact of 0 is left out.
     """
-    _check(kind, numbers)
-    shown = numbers[:-1] if kind == "S" and not numbers[-1] else numbers
-    body = ",".join([kind, *map(str, shown)]).encode()
+    for (name, low, high), number in zip(_FIELDS[kind], numbers, strict=True):
+        if not low <= number <= high:
+            raise DriverError(f"motor {name} {number} is outside {low} .. {high}; keep it inside")
+    sent = numbers[:-1] if kind == "S" and not numbers[-1] else numbers
+    body = ",".join([kind, *map(str, sent)]).encode()
     return b"$%b*%04X\n" % (body, crc16(body))
 
 
-def decode(line: bytes) -> tuple[str, tuple[int, ...]]:
-    """Return kind and numbers of a line, with or without its end; raise ProtocolError for any other bytes.
+def decode(line: bytes) -> tuple[str, tuple[int, ...]] | None:
+    """Return kind and numbers of a line, with or without its end; None for any other bytes.
 
     What is before the last "$" belongs to a line that was cut. The numbers of a status without a contact end with 0.
     """
     match = _LINE.fullmatch(line[max(0, line.rfind(b"$")) :])
-    if match is None:
-        raise ProtocolError(f"{line[:MAX_LINE]!r} is not a line of the motor protocol; check port and baud rate")
-    body, crc = match.groups()
-    if int(crc, 16) != crc16(body):
-        raise ProtocolError(f"{line[:MAX_LINE]!r} has a wrong checksum (found {crc16(body):04X}); check the cable")
-    kind, *texts = body.decode("ascii").split(",")
-    numbers = tuple(map(int, texts))
-    if kind == "S" and len(numbers) == len(_FIELDS["S"]) - 1:
+    if match is None or int(match[2], 16) != crc16(match[1]):
+        return None
+    kind, *texts = match[1].decode("ascii").split(",")
+    fields, numbers = _FIELDS[kind], tuple(map(int, texts))
+    if kind == "S" and len(numbers) == len(fields) - 1:
         numbers = (*numbers, 0)  # firmware without contacts
-    _check(kind, numbers)
-    return kind, numbers
-
-
-def _check(kind: str, numbers: Sequence[int]) -> None:
-    """Raise ProtocolError unless a line of a kind has these numbers."""
-    fields = _FIELDS[kind]
     if len(numbers) != len(fields):
-        raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(fields)}; check the firmware")
-    for (name, unit, low, high), number in zip(fields, numbers, strict=True):
-        if not low <= number <= high:
-            raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
+        return None
+    in_range = all(low <= number <= high for (_, low, high), number in zip(fields, numbers, strict=True))
+    return (kind, numbers) if in_range else None
 
 
 def crc16(data: bytes) -> int:
     """Return the CRC-16/CCITT-FALSE of data; that of b"123456789" is 0x29B1."""
     return binascii.crc_hqx(data, 0xFFFF)
-
-
-def velocity_line(seq: int, command: VelocityCommand) -> bytes:
-    """Return the line of a command; raise ProtocolError for a number that is not finite or out of its range."""
-    return encode("V", seq, *_motion(command))
-
-
-def status_line(seq: int, status: MotorStatus) -> bytes:
-    """Return the line of a status, as the controller writes it."""
-    battery_mv = -1 if math.isnan(status.battery_v) else round(status.battery_v * 1000)
-    contact = _BUMPER * status.bumper + _CLIFF * status.cliff
-    return encode("S", seq, *_motion(status), battery_mv, status.fault, int(status.watchdog_expired), contact)
-
-
-def command_of(numbers: Sequence[int]) -> VelocityCommand:
-    """Return the command in the numbers of a velocity line; its stamp, which is not sent, is 0."""
-    return VelocityCommand(0, *(milli / 1000 for milli in numbers[1:]))
-
-
-def status_of(numbers: Sequence[int]) -> MotorStatus:
-    """Return the status in the numbers of a status line."""
-    _, velocity, heading, yaw_rate, battery_mv, fault, expired, contact = numbers
-    battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
-    contacts = bool(contact & _BUMPER), bool(contact & _CLIFF)
-    return MotorStatus(velocity / 1000, heading / 1000, yaw_rate / 1000, bool(expired), fault, battery_v, *contacts)
-
-
-def _motion(source: VelocityCommand | MotorStatus) -> list[int]:
-    """Return velocity, heading and yaw rate in thousandths; raise ProtocolError for what is not finite."""
-    values = source.velocity_mps * 1000, source.heading_rad * 1000, source.yaw_rate_radps * 1000
-    for (name, *_), value in zip(_MOTION[1:], values, strict=True):
-        if not math.isfinite(value):
-            raise ProtocolError(f"motor {name} is {value}; only finite numbers can be sent, send a stop instead")
-    return list(map(round, values))
 
 
 class LineProtocol:
@@ -184,22 +119,32 @@ class LineProtocol:
         self._zero_rad = self._heading_rad
         return float(watchdog_ms)
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
+    def drive(self, command: VelocityCommand) -> Transaction[MotorStatus]:
         """Send one velocity line and return the status with the same seq."""
         velocity_mps, yaw_rate_radps = self._drive.limited(command)
         heading_rad = math.remainder(command.heading_rad - self._zero_rad, math.tau)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
-        line = velocity_line(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
-        status = status_of((yield from self._answer(line, "S", seq)))
-        self._heading_rad = math.remainder(status.heading_rad + self._zero_rad, math.tau)
-        return replace(status, heading_rad=self._heading_rad)
+        motion = (round(value * 1000) for value in (velocity_mps, heading_rad, yaw_rate_radps))
+        answer = yield from self._answer(encode("V", seq, *motion), "S", seq)
+        _, velocity, heading, yaw_rate, battery_mv, fault, expired, contact = answer
+        self._heading_rad = math.remainder(heading / 1000 + self._zero_rad, math.tau)
+        battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
+        return MotorStatus(
+            velocity / 1000,
+            self._heading_rad,
+            yaw_rate / 1000,
+            bool(expired),
+            fault,
+            battery_v,
+            bool(contact & BUMPER),
+            bool(contact & CLIFF),
+        )
 
     def _answer(self, line: bytes, kind: str, seq: int | None = None) -> Transaction[tuple[int, ...]]:
         """Send a line and return the numbers of the first line of this kind, with this seq if one is given."""
         frame = yield line
         while True:
-            with suppress(ProtocolError):
-                found, numbers = decode(frame)
-                if found == kind and seq in (None, numbers[0]):
-                    return numbers
+            found = decode(frame)
+            if found is not None and found[0] == kind and seq in (None, found[1][0]):
+                return found[1]
             frame = yield b""

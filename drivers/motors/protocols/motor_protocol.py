@@ -54,11 +54,8 @@ class MotorProtocol(Protocol):
         Raises DriverError where the controller does not take the settings.
         """
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
-        """Send a command and return the status; raise DriverError for a command that the controller rejects.
-
-        now_s: time of any monotonic clock.
-        """
+    def drive(self, command: VelocityCommand) -> Transaction[MotorStatus]:
+        """Send a command and return the status; raise DriverError for a command that the controller rejects."""
 
 
 def require_watchdog(requested_ms: int, in_force_ms: float) -> None:

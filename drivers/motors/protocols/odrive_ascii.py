@@ -66,7 +66,7 @@ class ODriveAscii:
             require_watchdog(watchdog_ms, 1000 * timeout[0] if enabled[0] else 0.0)
         return float(watchdog_ms)
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
+    def drive(self, command: VelocityCommand) -> Transaction[MotorStatus]:
         """Send both velocities and the requests for the status at once; a stop arms disarmed axes."""
         arming = self._disarmed and is_stop(command)
         speeds = self._drive.channels(command)

@@ -49,7 +49,7 @@ class Roboteq:
         require_watchdog(watchdog_ms, values[b"RWD"][0])
         return values[b"RWD"][0]
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
+    def drive(self, command: VelocityCommand) -> Transaction[MotorStatus]:
         """Send the commands of both channels and the queries at once, and return the status."""
         speeds_mps = self._drive.channels(command, MAX_RPM / self._rpm_per_mps)
         lines = [b"!S %d %d" % (channel, round(mps * self._rpm_per_mps)) for channel, mps in enumerate(speeds_mps, 1)]

@@ -127,7 +127,7 @@ class Vesc:
                 )
         return float(min(first[1], second[1]))
 
-    def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
+    def drive(self, command: VelocityCommand) -> Transaction[MotorStatus]:
         """Send the queries, then both speeds, at once; a speed sent before would clear an expired timeout."""
         erpm_per_mps = self._drive.rpm_per_mps * self._drive.pole_pairs
         speeds = self._drive.channels(command, MAX_ERPM / erpm_per_mps)

@@ -25,7 +25,7 @@ from drivers.motor import VelocityCommand
 from omnid.controller.controller import Controller
 from omnid.controller.ipc import Channel, ControllerStart, ControllerUpdate, socket_pair
 from omnid.controller.link import ControllerLink
-from omnid.controller.motor_settings import MotorSettings
+from omnid.controller.motor import MotorSettings
 from omnid.controller.process import ControllerLoop, run_controller
 from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control import safety_rules

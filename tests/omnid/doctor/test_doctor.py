@@ -18,9 +18,10 @@ from calib.rig_file import read_rig, write_rig
 from drivers.cameras.v4l2_device import CaptureDevice, StreamFormat
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from omnid.cli import main
 from omnid.config import RecordConfig
-from omnid.controller.motor_settings import DriveSettings, MotorSettings
+from omnid.controller.motor import MotorSettings
 from omnid.doctor import checks
 from omnid.doctor.checks import Finding, bus, cameras, disk, motor, rig
 from omnid.doctor.wheel_wiring import tested_drive as drive_by_answers
@@ -235,8 +236,8 @@ class Person:
 @contextlib.contextmanager
 def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, Person, PtyMotor]]:
     """Yield settings that do not know the wiring, a person, and the base."""
-    drive = DriveSettings(wheel_radius_m=RADIUS_M, gear=20.0)
-    true = replace(drive.geometry(), **wiring)  # type: ignore[arg-type]
+    drive = DifferentialDrive(wheel_radius_m=RADIUS_M, gear=20.0)
+    true = replace(drive, **wiring)  # type: ignore[arg-type]
     watched = WatchedController(SIMULATED_CONTROLLERS[protocol](true))
     with contextlib.closing(PtyMotor(watched)) as motor:
         # At 5 Hz an answer may take 0.16 s: a busy computer is not what is tested here.

@@ -1,4 +1,4 @@
-"""Simulated base with two driven wheels: commands, watchdogs, motion; its time is advanced by the caller."""
+"""A simulated base with two driven wheels: commands, watchdogs, motion; and the driver of its motor controller."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.motor import VelocityCommand
+from drivers.errors import DriverError
+from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import Framer
 
 STEP_S = 0.005  # Step of the integration.
 REACHED = 1e-3  # m/s or rad/s: friction ends the lag
-LONGEST_ADVANCE_S = 60.0
 LEFT, RIGHT = SIDES = (0, 1)
 Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
 # Travel over the ground [m] of the left and the right wheel for a time [s] and the travel of their rims.
@@ -36,16 +35,10 @@ def no_slip(_: float, left_m: float, right_m: float) -> tuple[float, float]:
 
 
 class SimulatedBase:
-    """Wheels of a simulated controller, each with its own watchdog; after it has expired, a stop must come first.
-
-    The controller counts valid commands in `commands`, and in `errors` all that a real one would reject.
-    """
+    """Wheels of a simulated controller, each with its own watchdog; its time is advanced by the caller."""
 
     def __init__(self, drive: DifferentialDrive | None = None, limits: MotionLimits | None = None) -> None:
         self.drive = drive or DifferentialDrive()
-        self.commands = self.errors = 0
-        self.expiries = 0  # times that the watchdog has stopped the wheels
-        self.unsafe_resumes = 0  # motion commands to a wheel that needed a stop first
         self.watchdog_ms = 500.0  # 0 is off
         self.fault = 0
         self.bumper = self.cliff = False  # contacts that it reports
@@ -56,7 +49,6 @@ class SimulatedBase:
         self.goal_heading_rad: float | None = None  # in the world; steered to during motion, if set
         self.commanded_mps = [0.0, 0.0]  # left, right
         self.expired = [False, False]  # watchdogs: left, right
-        self._needs_stop = [False, False]
         self._since_command_s = [0.0, 0.0]
         self.limits = limits or MotionLimits()
         self.traction: Traction = no_slip
@@ -66,12 +58,6 @@ class SimulatedBase:
         """True if a watchdog has stopped a wheel."""
         return any(self.expired)
 
-    @property
-    def last_command(self) -> VelocityCommand:
-        """The last commanded motion, with stamp and heading 0."""
-        velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
-        return VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps)
-
     def command(self, velocity_mps: float, yaw_rate_radps: float) -> None:
         """Command a motion of the base."""
         half_mps = yaw_rate_radps * self.drive.track_m / 2
@@ -80,10 +66,7 @@ class SimulatedBase:
 
     def command_wheel(self, side: int, speed_mps: float) -> None:
         """Command the speed of one wheel, forward positive, and feed its watchdog."""
-        if self._needs_stop[side] and speed_mps != 0.0:
-            self.unsafe_resumes += 1
-            self.errors += 1
-        self._needs_stop[side] = self.expired[side] = False
+        self.expired[side] = False
         self.commanded_mps[side] = speed_mps
         self.feed(side)
 
@@ -91,24 +74,21 @@ class SimulatedBase:
         """Feed the watchdog of one wheel."""
         self._since_command_s[side] = 0.0
 
-    def expire(self) -> None:
-        """Let both watchdogs stop the wheels now."""
-        self.expiries += not self.watchdog_expired
-        for side in SIDES:
-            self._stop(side)
-
     def advance(self, dt_s: float) -> None:
         """Advance watchdogs, wheels and pose by dt_s."""
         steps = math.ceil(dt_s / STEP_S)
         for _ in range(steps):
             self._step(dt_s / steps)
 
-    def _stop(self, side: int) -> None:
-        self.expired[side] = self._needs_stop[side] = True
-        self.commanded_mps[side] = 0.0
+    def expire(self, side: int) -> None:
+        """Let the watchdog of one wheel stop it."""
+        self.expired[side], self.commanded_mps[side] = True, 0.0
 
     def _step(self, dt_s: float) -> None:
-        self._update_watchdogs(dt_s)
+        for side in SIDES:
+            self._since_command_s[side] += dt_s
+            if 0.0 < self.watchdog_ms < self._since_command_s[side] * 1000 and not self.expired[side]:
+                self.expire(side)
         velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
         limits = self.limits
         self.velocity_mps += self._step_to(velocity_mps - self.velocity_mps, limits.acceleration_mps2, dt_s)
@@ -122,14 +102,6 @@ class SimulatedBase:
         if lag_s and abs(difference) > REACHED:
             difference *= 1.0 - math.exp(-dt_s / lag_s)
         return _clamp(difference, acceleration * dt_s)
-
-    def _update_watchdogs(self, dt_s: float) -> None:
-        before = self.watchdog_expired
-        for side in SIDES:
-            self._since_command_s[side] += dt_s
-            if 0.0 < self.watchdog_ms < self._since_command_s[side] * 1000 and not self.expired[side]:
-                self._stop(side)
-        self.expiries += self.watchdog_expired and not before
 
     def _yaw_rate_to_goal(self, yaw_rate_radps: float) -> float:
         """Return the yaw rate towards the goal heading; the commanded one without a goal, or where the base stops."""
@@ -153,24 +125,44 @@ class SimulatedBase:
         return (left_mps + right_mps) / 2, (right_mps - left_mps) / self.drive.track_m
 
 
-class SimulatedFirmware:
-    """Simulated firmware of one kind of controller: handles frames, and turns the wheels of its base."""
+class SimulatedMotor:
+    """A MotorDriver of a controller that holds headings, whose base moves as time passes by a clock.
 
-    def __init__(self, base: SimulatedBase, framer: Framer) -> None:
-        self.base, self._framer = base, framer
+    Like the serial driver it sends a stop in place of the first command after the watchdog has stopped the wheels.
+    """
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to all frames that end in data."""
-        return b"".join(self.handle(frame) for frame in self._framer.feed(data))
+    def __init__(self, drive: DifferentialDrive, watchdog_ms: int, clock_ns: Callable[[], int]) -> None:
+        self.base, self._clock_ns = SimulatedBase(drive), clock_ns
+        self.base.watchdog_ms = watchdog_ms
+        self._now_ns = clock_ns()
+        self.status: MotorStatus | None = None  # the last reply
+        self.cut = False  # fault: no command arrives
 
-    def handle(self, frame: bytes) -> bytes:
-        """Return the reply to a frame, empty without one."""
-        raise NotImplementedError
+    def advance(self) -> None:
+        """Let the base move until now."""
+        now_ns = self._clock_ns()
+        self.base.advance((now_ns - self._now_ns) * 1e-9)
+        self._now_ns = now_ns
 
-    def _reject(self, reply: bytes) -> bytes:
-        """Count an error and return the reply to it."""
-        self.base.errors += 1
-        return reply
+    def send(self, command: VelocityCommand) -> MotorStatus:
+        """Command a motion and return the controller's status before it; DriverError where the line is cut."""
+        self.advance()
+        self.status = None
+        if self.cut:
+            raise DriverError("the simulated motor controller gave no answer")
+        base = self.base
+        velocity_mps, yaw_rate_radps = base.drive.limited(command)
+        state = base.watchdog_expired, base.fault, base.battery_v, base.bumper, base.cliff
+        self.status = MotorStatus(base.velocity_mps, base.pose[2], base.yaw_rate_radps, *state)
+        steers = not is_stop(command) and not base.watchdog_expired
+        base.goal_heading_rad = command.heading_rad if steers else None
+        base.command(velocity_mps * steers, yaw_rate_radps * steers)
+        return self.status
+
+    def close(self) -> None:
+        """Stop the wheels."""
+        self.cut = False
+        self.send(stop_command(0))
 
 
 def _clamp(value: float, magnitude: float) -> float:
