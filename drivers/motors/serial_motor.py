@@ -24,8 +24,6 @@ from drivers.motors.protocols.line_protocol import LineProtocol
 from drivers.motors.protocols.motor_protocol import MotorProtocol, NoReplyError, T, Transaction
 
 SET_UP_S: Final = 0.2  # time for the answer to the setting-up: an ODrive needs 0.1 s
-STOPS_AT_CLOSE: Final = 3  # tries
-READ_LIMIT_BYTES: Final = 4096
 POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
 FRESH_SHARE: Final = 0.5  # After a pause of this share of the watchdog's time it may expire before a command arrives.
 LONGEST_WAIT_S: Final = 2.0  # between two attempts to open the port, or to set up the controller
@@ -67,7 +65,7 @@ class SerialMotor:
     """The base on a serial port, locked for this program.
 
     `send` blocks for at most timeout_s, SET_UP_S more where the controller is set up, plus the time to open the port
-    where it was gone; `close` for STOPS_AT_CLOSE times timeout_s. A command is sent once and never repeated: the caller
+    where it was gone; `close` for twice timeout_s. A command is sent once and never repeated: the caller
     sends the next one at its own rate.
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
@@ -141,7 +139,7 @@ class SerialMotor:
         """Stop the wheels if the controller replies, and release the port; a second call does nothing."""
         self._closed = True
         with contextlib.suppress(DriverError):
-            for _ in range(STOPS_AT_CLOSE if self._port is not None else 0):
+            for _ in range(2 if self._port is not None else 0):  # a second try where the first gets no reply
                 with contextlib.suppress(NoReplyError):
                     self._run(self._protocol.drive(stop_command(0)), self._timeout_s)
                     break
@@ -158,8 +156,8 @@ class SerialMotor:
             except NoReplyError:
                 if is_over:
                     raise
-            if is_over and self._state is _State.STOP_FIRST:
-                raise DriverError(f"motor on {self._name} stays stopped by its watchdog; switch it off and on again")
+            if is_over:  # a controller whose watchdog stays expired says so in each status
+                return
 
     def _try_again(self) -> None:
         """Set up the controller, unless the last try failed just now; raise DriverError then, and where it fails."""
@@ -263,12 +261,12 @@ class SerialMotor:
         """
         if self._port is None:
             raise NoReplyError("gave no answer: the port is closed")
-        while not self._port.in_waiting:
+        while not (waiting := self._port.in_waiting):
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
                 return b""
             time.sleep(min(left_s, POLL_PERIOD_S))
-        return os.read(self._port.fileno(), READ_LIMIT_BYTES)
+        return os.read(self._port.fileno(), waiting)
 
 
 def _opened(port: str, baud: int) -> serial.Serial:

@@ -29,11 +29,6 @@ class MotionLimits:
     lag_s: float = 0.0  # time constant with which the speeds follow the commands
 
 
-def no_slip(_: float, left_m: float, right_m: float) -> tuple[float, float]:
-    """Return the travel of wheels that do not slip."""
-    return left_m, right_m
-
-
 class SimulatedBase:
     """Wheels of a simulated controller, each with its own watchdog; its time is advanced by the caller."""
 
@@ -45,13 +40,12 @@ class SimulatedBase:
         self.battery_v = 12.0
         self.pose: Pose = (0.0, 0.0, 0.0)
         self.velocity_mps = self.yaw_rate_radps = 0.0
-        self.travel_m = [0.0, 0.0]  # left and right wheel
         self.goal_heading_rad: float | None = None  # in the world; steered to during motion, if set
         self.commanded_mps = [0.0, 0.0]  # left, right
         self.expired = [False, False]  # watchdogs: left, right
         self._since_command_s = [0.0, 0.0]
         self.limits = limits or MotionLimits()
-        self.traction: Traction = no_slip
+        self.traction: Traction = lambda _, left_m, right_m: (left_m, right_m)
 
     @property
     def watchdog_expired(self) -> bool:
@@ -114,8 +108,6 @@ class SimulatedBase:
         x_m, y_m, heading_rad = self.pose
         half_m = self.yaw_rate_radps * dt_s * self.drive.track_m / 2
         rims_m = self.velocity_mps * dt_s - half_m, self.velocity_mps * dt_s + half_m
-        self.travel_m[LEFT] += rims_m[LEFT]
-        self.travel_m[RIGHT] += rims_m[RIGHT]
         distance_m, rotation_rad = self._twist(*self.traction(dt_s, *rims_m))
         chord_rad = heading_rad + rotation_rad / 2
         x_m, y_m = x_m + distance_m * math.cos(chord_rad), y_m + distance_m * math.sin(chord_rad)

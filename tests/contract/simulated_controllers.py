@@ -44,6 +44,12 @@ class FirmwareBase(SimulatedBase):
         self.expiries = 0  # times that the watchdog has stopped the wheels
         self.unsafe_resumes = 0  # motion commands to a wheel that needed a stop first
         self._needs_stop = [False, False]
+        self.travel_m = [0.0, 0.0]  # left and right wheel
+        self.traction = self._roll
+
+    def _roll(self, _: float, left_m: float, right_m: float) -> tuple[float, float]:
+        self.travel_m = [self.travel_m[LEFT] + left_m, self.travel_m[RIGHT] + right_m]
+        return left_m, right_m
 
     @property
     def last_command(self) -> VelocityCommand:
@@ -142,16 +148,12 @@ class SimulatedLine(SimulatedFirmware):
         turned_rad = math.remainder(base.pose[2] - self._zero_rad, math.tau)
         measured = (round(value * 1000) for value in (base.velocity_mps, turned_rad, base.yaw_rate_radps))
         contact = BUMPER * base.bumper + CLIFF * base.cliff
-        state = round(base.battery_v * 1000), base.fault, int(self.is_expired()), contact
+        state = round(base.battery_v * 1000), base.fault, int(base.watchdog_expired), contact
         reply = encode("S", seq, *measured, *state)
         steers = self._heading_input and (velocity or yaw_rate)
         base.goal_heading_rad = heading / 1000 + self._zero_rad if steers else None
         base.command(velocity / 1000, yaw_rate / 1000)
         return reply
-
-    def is_expired(self) -> bool:
-        """True if the watchdog has stopped the wheels."""
-        return self.base.watchdog_expired
 
 
 class SimulatedRoboteq(SimulatedFirmware):

@@ -48,16 +48,21 @@ SEQ_COUNT: Final = 65536
 _LINE: Final = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")
 BUMPER, CLIFF = 1, 2  # bits of the contact
 
-# Name, lowest and highest number of the fields of each kind of line, as in the table above.
-_MOTION: Final = (
-    ("seq", 0, SEQ_COUNT - 1),
-    ("velocity", -10_000, 10_000),
-    ("heading", -3142, 3142),
-    ("yaw rate", -20_000, 20_000),
-)
-_STATE: Final = (("battery", -1, 100_000), ("fault", 0, 65535), ("expired", 0, 1), ("contact", 0, BUMPER | CLIFF))
-_TIME: Final = (("watchdog time", 20, 10_000),)
-_FIELDS: Final = {"V": _MOTION, "S": (*_MOTION, *_STATE), "W": _TIME, "A": _TIME}
+# Lowest and highest number of each field, and the fields of each kind of line, as above.
+_RANGES: Final = {
+    "seq": (0, SEQ_COUNT - 1),
+    "velocity": (-10_000, 10_000),
+    "heading": (-3142, 3142),
+    "yaw rate": (-20_000, 20_000),
+    "battery": (-1, 100_000),
+    "fault": (0, 65535),
+    "expired": (0, 1),
+    "contact": (0, BUMPER | CLIFF),
+    "time": (20, 10_000),
+}
+_MOTION: Final = ("seq", "velocity", "heading", "yaw rate")
+_STATUS: Final = (*_MOTION, "battery", "fault", "expired", "contact")
+_FIELDS: Final = {"V": _MOTION, "S": _STATUS, "W": ("time",), "A": ("time",)}
 
 
 def encode(kind: str, *numbers: int) -> bytes:
@@ -65,7 +70,8 @@ def encode(kind: str, *numbers: int) -> bytes:
 
     A contact of 0 is left out.
     """
-    for (name, low, high), number in zip(_FIELDS[kind], numbers, strict=True):
+    for name, number in zip(_FIELDS[kind], numbers, strict=True):
+        low, high = _RANGES[name]
         if not low <= number <= high:
             raise DriverError(f"motor {name} {number} is outside {low} .. {high}; keep it inside")
     sent = numbers[:-1] if kind == "S" and not numbers[-1] else numbers
@@ -87,7 +93,8 @@ def decode(line: bytes) -> tuple[str, tuple[int, ...]] | None:
         numbers = (*numbers, 0)  # firmware without contacts
     if len(numbers) != len(fields):
         return None
-    in_range = all(low <= number <= high for (_, low, high), number in zip(fields, numbers, strict=True))
+    ranges = (_RANGES[name] for name in fields)
+    in_range = all(low <= number <= high for (low, high), number in zip(ranges, numbers, strict=True))
     return (kind, numbers) if in_range else None
 
 

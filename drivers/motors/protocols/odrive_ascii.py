@@ -27,13 +27,11 @@ from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
 
-AXES = (0, 1)
 WATCHDOG_EXPIRED = 0x800  # AXIS_ERROR_WATCHDOG_TIMER_EXPIRED (firmware 0.5, odrive-interface.yaml)
 CLOSED_LOOP = 8  # AXIS_STATE_CLOSED_LOOP_CONTROL
 VELOCITY_CONTROL = 2  # CONTROL_MODE_VELOCITY_CONTROL
 
 _CHECKED_LINE = re.compile(rb"([^*]*)\*([0-9]{1,3})")
-_MAX_NUMBERS = 3  # parsed of a reply; more than any reply has
 
 
 def with_checksum(line: str) -> bytes:
@@ -57,9 +55,9 @@ class ODriveAscii:
         Raises DriverError where another time is in force, or an axis has an error other than its watchdog's.
         """
         self._disarmed = True
-        lines = [line for axis in AXES for line in _setup(axis, watchdog_ms / 1000)]
+        lines = [line for axis in (0, 1) for line in _setup(axis, watchdog_ms / 1000)]
         properties = ("config.enable_watchdog", "config.watchdog_timeout", "error")
-        replies = yield from self._query(lines, [f"r axis{axis}.{name}" for axis in AXES for name in properties])
+        replies = yield from self._query(lines, [f"r axis{axis}.{name}" for axis in (0, 1) for name in properties])
         for enabled, timeout, error in zip(*[iter(replies)] * len(properties), strict=True):
             if int(error[0]) & ~WATCHDOG_EXPIRED:
                 raise DriverError(f"an axis has error 0x{int(error[0]):x}; see `odrivetool`, dump_errors(odrv0, True)")
@@ -70,9 +68,9 @@ class ODriveAscii:
         """Send both velocities and the requests for the status at once; a stop arms disarmed axes."""
         arming = self._disarmed and is_stop(command)
         speeds = self._drive.channels(command)
-        lines = [f"v {axis} {mps * self._drive.turns_per_m:.5f}" for axis, mps in zip(AXES, speeds, strict=True)]
+        lines = [f"v {axis} {mps * self._drive.turns_per_m:.5f}" for axis, mps in enumerate(speeds)]
         if arming:
-            lines += [line for axis in AXES for line in _arming(axis)]
+            lines += [line for axis in (0, 1) for line in _arming(axis)]
         requests = ["f 0", "f 1", "r axis0.error", "r axis1.error", "r vbus_voltage"]
         first, second, first_error, second_error, battery = yield from self._query(lines, requests)
         flags = int(first_error[0]) | int(second_error[0])
@@ -108,7 +106,7 @@ class ODriveAscii:
             raise DriverError(f"it answered {reply!r}; a board with two axes and firmware 0.5 is needed")
         words = match[1].lower().replace(b"true", b"1").replace(b"false", b"0").split()
         try:
-            numbers = [float(word) for word in words[:_MAX_NUMBERS]]
+            numbers = [float(word) for word in words]
         except ValueError:
             return None
         return numbers if all(map(math.isfinite, numbers)) else None

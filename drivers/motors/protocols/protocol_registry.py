@@ -24,7 +24,6 @@ from drivers.motors.protocols.vesc import Vesc
 
 GROUP: Final = "omnid.motor_protocols"
 ProtocolFactory: TypeAlias = Callable[[DifferentialDrive], MotorProtocol]
-
 PROTOCOLS: Final[Mapping[str, ProtocolFactory]] = {
     "line": LineProtocol,
     "roboteq": Roboteq,

@@ -19,7 +19,6 @@ import binascii
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
@@ -31,10 +30,6 @@ MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fau
 MAX_PAYLOAD = 512  # bytes; PACKET_MAX_PL_LEN in packet.h
 MAX_ERPM = 0x7FFFFFFF  # int32
 SHORT, LONG, END = 2, 3, 3  # first byte of a packet, also the size of its head: 1 or 2 bytes of length; last byte
-_TAIL_BYTES = 3  # CRC and END
-_MIN_LONG_PAYLOAD = 255
-_EXPIRED = 1  # bit of the status
-
 _CONFIG = struct.Struct(">xIBI")  # signature, id, timeout [ms]
 _VALUES = struct.Struct(">BIihBB")  # command, mask, erpm, 0.1 V, fault, id; then the status where the firmware has it
 
@@ -51,16 +46,6 @@ def forwarded(can_id: int, payload: bytes) -> bytes:
     return bytes((FORWARD_CAN, can_id)) + payload
 
 
-@dataclass(frozen=True, slots=True)
-class VescValues:
-    """State of one controller."""
-
-    erpm: int  # electrical revolutions per minute
-    battery_v: float
-    fault: int  # mc_fault_code in datatypes.h; 0 is none
-    expired: bool  # its timeout has stopped the motor
-
-
 class PacketFramer:
     """Splits a byte stream into payloads; a byte that does not start a packet is skipped."""
 
@@ -72,12 +57,16 @@ class PacketFramer:
         self._buffer += data
         payloads, start = [], 0
         while (head := self._buffer[start : start + LONG]) and (head[0] not in (SHORT, LONG) or len(head) >= head[0]):
-            length = _length(head)
-            end = start + head[0] + length + _TAIL_BYTES
-            if length and end > len(self._buffer):
+            # 1. The length by the first bytes, 0 where no packet begins with them.
+            length = int.from_bytes(head[1 : head[0]], "big") if head[0] in (SHORT, LONG) else 0
+            first, last = start + head[0], start + head[0] + length
+            end = last + len(_tail(b""))
+            is_packet = 0 < length <= MAX_PAYLOAD
+            if is_packet and end > len(self._buffer):
                 break  # It is incomplete.
-            payload = bytes(self._buffer[start + head[0] : end - _TAIL_BYTES])
-            if length and self._buffer[end - _TAIL_BYTES : end] == _tail(payload):
+            # 2. A whole packet with the right checksum, or else a byte that starts none.
+            payload = bytes(self._buffer[first:last])
+            if is_packet and self._buffer[last:end] == _tail(payload):
                 payloads.append(payload)
                 start = end
             else:
@@ -88,14 +77,6 @@ class PacketFramer:
     def reset(self) -> None:
         """Discard the incomplete packet."""
         self._buffer.clear()
-
-
-def _length(head: bytearray) -> int:
-    """Return the length of the payload by a packet's first bytes, 0 where no packet begins with them."""
-    if head[0] == SHORT:
-        return head[1]
-    length = head[1] << 8 | head[2] if head[0] == LONG else 0
-    return length if _MIN_LONG_PAYLOAD <= length <= MAX_PAYLOAD else 0
 
 
 def _tail(payload: bytes) -> bytes:
@@ -135,9 +116,9 @@ class Vesc:
         packets = packet(commands[0]) + packet(forwarded(self._drive.can_id, commands[1]))
         query = struct.pack(">BI", GET_VALUES_SELECTIVE, MASK)
         (_, first), (_, second) = yield from self._query_both(query, _values, packets)
-        velocity_mps, yaw_rate_radps = self._drive.motion(first.erpm / erpm_per_mps, second.erpm / erpm_per_mps)
-        return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, first.expired or second.expired,
-                           first.fault or second.fault, min(first.battery_v, second.battery_v))  # fmt: skip
+        erpms, volts, faults, expired = zip(first, second, strict=True)
+        velocity_mps, yaw_rate_radps = self._drive.motion(*(erpm / erpm_per_mps for erpm in erpms))
+        return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, any(expired), faults[0] or faults[1], min(volts))
 
     def _query_both(
         self, query: bytes, parse: Callable[[bytes], tuple[int, T] | None], commands: bytes = b""
@@ -163,12 +144,15 @@ def _config(payload: bytes) -> tuple[int, int] | None:
     return can_id, timeout_ms
 
 
-def _values(payload: bytes) -> tuple[int, VescValues] | None:
-    """Return id and state, None of another payload."""
+def _values(payload: bytes) -> tuple[int, tuple[int, float, int, bool]] | None:
+    """Return id and (electrical rpm, battery [V], fault, True if the timeout expired), None of another payload.
+
+    The fault is a number of mc_fault_code in datatypes.h; 0 is none.
+    """
     if payload[0] != GET_VALUES_SELECTIVE or not _VALUES.size <= len(payload) <= _VALUES.size + 1:
         return None
     _, mask, erpm, decivolt, fault, can_id = _VALUES.unpack_from(payload)
     if mask != MASK:
         return None
-    expired = len(payload) > _VALUES.size and bool(payload[-1] & _EXPIRED)
-    return can_id, VescValues(erpm, decivolt / 10, fault, expired)
+    expired = len(payload) > _VALUES.size and bool(payload[-1] & 1)
+    return can_id, (erpm, decivolt / 10, fault, expired)

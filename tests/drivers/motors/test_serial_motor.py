@@ -139,19 +139,6 @@ def test_verifies_the_watchdog_in_force() -> None:
         SerialMotor(simulated.port, timeout_s=REPLY_S)
 
 
-class ExpiredForever(SimulatedLine):
-    """A controller whose watchdog stays expired."""
-
-    def is_expired(self) -> bool:
-        return True
-
-
-def test_a_watchdog_that_stays_expired_is_an_error() -> None:
-    controller = ExpiredForever()
-    with contextlib.closing(PtyMotor(controller)) as simulated, pytest.raises(DriverError, match="stays stopped"):
-        SerialMotor(simulated.port, timeout_s=REPLY_S, connect_s=0.1)
-
-
 # The protocol's host, without a port
 
 
