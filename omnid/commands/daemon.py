@@ -8,7 +8,6 @@ import sys
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -135,8 +134,7 @@ def simulate(args: argparse.Namespace) -> int:
     world = load_world(args.world, args.seed, options)
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
-    warn = partial(log, logging.WARNING)
-    paced = PacedRobot(world, robot, config, args.seed, warn, keeps_truth=args.truth is not None)
+    paced = PacedRobot(world, robot, config, args.seed)
     run = _live_run(config, paced, paced.rig)
     code = run.run()
     # 2. Write the truth, and report contacts.

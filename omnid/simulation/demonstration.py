@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from typing import Final
 
 import numpy as np
@@ -13,7 +13,6 @@ from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, Sheet, draw_ends, draw_plan, with_legend
-from omnid.messages import NavigationUpdate, ObstacleScan, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.world import World, distances_m
@@ -23,8 +22,6 @@ Array = NDArray[np.float64]
 ROUTE: Final = "demo"
 STRAIGHT_M, RADIUS_M = 0.8, 0.7  # The oval that is taught: 6 m.
 ARC_STEPS: Final = 15
-ANSWER_S: Final = 0.5  # Time after a request before its end is awaited.
-RECOGNISED_S: Final = 5.0  # Within this time after the first drive the robot must have recognised the start.
 PX_PER_M: Final = 90.0
 BORDER_M: Final = 0.25  # around the world
 LEGEND: Final = (  # colour (BGR) and width [px]
@@ -48,54 +45,50 @@ class TeachAndRepeat:
 
     def __init__(self, show: Callable[[str], None]) -> None:
         self._show = show
-        self._taught = False
-        self._asked_s, self._driven_s = 0.0, math.inf
         self.repeated_s = math.inf  # when the repetition began
         self.end = ""  # in words
+        self._steps = self._drive()
+        next(self._steps)
 
-    def __call__(self, moment: Moment) -> Iterator[Request]:
-        """Send the next requests when what was asked for has ended."""
-        if moment.place is None:
-            return
-        if not self._asked_s:
-            yield from self._teach(moment)
-        elif moment.navigation is not None and moment.time_s >= self._asked_s + ANSWER_S:
-            yield from self._continue(moment, moment.place, moment.navigation)
+    def __call__(self, moment: Moment) -> Iterable[Request]:
+        """Return the next requests, once what was asked for has ended."""
+        return self._steps.send(moment)
 
-    def _teach(self, moment: Moment) -> Iterator[Request]:
-        """Arm the wheels, then teach the route along an oval."""
-        if not moment.controller.armed:
-            yield "arm"
-            return
-        self._begin(moment, "is taught the route: it is driven along an oval")
-        yield RouteRequest(RouteAction.TEACH, ROUTE, replace=True)  # that of an earlier demonstration
-        yield PathRequest(NavigationFrame.ODOM, oval(), 0.0)
+    def _drive(self) -> Generator[list[Request], Moment, None]:
+        """Yield the requests of each moment."""
+        # 1. Arm the wheels.
+        moment = yield []
+        while moment.place is None or not moment.controller.armed:
+            moment = yield [] if moment.place is None else ["arm"]
+        # 2. Teach the route along an oval; a route of that name is from an earlier demonstration.
+        self._show(f"{moment.time_s:5.1f} s: is taught the route: it is driven along an oval")
+        teach = RouteRequest(RouteAction.TEACH, ROUTE, replace=True)
+        moment = yield from self._ended([teach, PathRequest(NavigationFrame.ODOM, oval(), 0.0)])
+        # 3. Repeat it, when its start is recognised.
+        if self.end == NavigationState.REACHED:
+            while moment.place is None or moment.place.state is not MapState.LOCALIZED:
+                moment = yield []
+            self._show(f"{moment.time_s:5.1f} s: repeats the route in the map that it has made")
+            self.repeated_s, self.end = moment.time_s, ""
+            yield from self._ended([RouteRequest(RouteAction.FINISH), RouteRequest(RouteAction.REPEAT, ROUTE)])
+        while True:
+            yield ["end"]
 
-    def _continue(self, moment: Moment, place: PlaceUpdate, navigation: NavigationUpdate) -> Iterator[Request]:
-        """At the end of the oval repeat the route, and at that of the repetition end the run."""
-        refusal = "" if navigation.answer is None else navigation.answer.refusal
-        if refusal or (navigation.state.is_end and navigation.state is not NavigationState.REACHED):
-            self.end = f"refused: {refusal}" if refusal else f"{navigation.state}: {navigation.reason}"
-            yield "end"
-        elif navigation.state is NavigationState.REACHED and not self._taught:
-            self._driven_s = min(self._driven_s, moment.time_s)
-            if place.state is not MapState.LOCALIZED:
-                if moment.time_s > self._driven_s + RECOGNISED_S:
-                    self.end = "the start of the route was not recognised"
-                    yield "end"
-                return
-            self._taught = True
-            self._begin(moment, "repeats the route in the map that it has made")
-            self.repeated_s = moment.time_s
-            yield RouteRequest(RouteAction.FINISH)
-            yield RouteRequest(RouteAction.REPEAT, ROUTE)
-        elif navigation.state is NavigationState.REACHED:
-            self.end = NavigationState.REACHED
-            yield "end"
-
-    def _begin(self, moment: Moment, text: str) -> None:
-        self._asked_s = moment.time_s
-        self._show(f"{moment.time_s:5.1f} s: {text}")
+    def _ended(self, requests: list[Request]) -> Generator[list[Request], Moment, Moment]:
+        """Yield requests, and nothing until the drive has ended; keep how. Return the moment."""
+        moment = yield requests
+        has_begun = False
+        while True:
+            if (update := moment.navigation) is not None:
+                has_begun = has_begun or not update.state.is_end
+                if update.answer is not None and update.answer.refusal:
+                    self.end = f"refused: {update.answer.refusal}"
+                    return moment
+                if has_begun and update.state.is_end:
+                    is_there = update.state is NavigationState.REACHED
+                    self.end = update.state if is_there else f"{update.state}: {update.reason}"
+                    return moment
+            moment = yield []
 
 
 def both_paths(run: SimulatedRun, repeated_s: float) -> tuple[Array, Array]:
@@ -113,16 +106,12 @@ def cross_track_m(first: Array, second: Array) -> Array:
 
 def seen_obstacles(run: SimulatedRun) -> Array:
     """Return the obstacles (N, 2) [m] of all scans, where the robot believes them, in the world."""
-    if not len(run.T_world_base):
-        return np.zeros((0, 2))
-    directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(len(azimuths()))])
-
-    def places(scan: ObstacleScan) -> Array:
+    directions, found = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(len(azimuths()))]), []
+    for scan in run.scans:
         seen = np.isfinite(scan.ranges_m)
         at = scan.ranges_m[seen, None] * directions[seen]
-        return np.asarray(se3.apply(run.T_world_base[0] @ scan.T_odom_base, at)[:, :2])
-
-    return np.vstack([np.zeros((0, 2)), *(places(scan) for scan in run.scans)])
+        found.append(se3.apply(run.T_world_base[0] @ scan.T_odom_base, at)[:, :2])
+    return np.vstack([np.zeros((0, 2)), *found])
 
 
 def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray[np.uint8]:

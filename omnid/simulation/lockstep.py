@@ -20,7 +20,7 @@ from calib import se3
 from drivers.frame import Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.statistics import ControllerState, TickReport
+from omnid.controller.statistics import ControllerState
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
@@ -35,8 +35,7 @@ from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests
 from omnid.runs.session import run_to_end
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
-from omnid.simulation.robot import SimulatedRobot, with_masks
-from omnid.simulation.vehicle import Tick, Vehicle
+from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER
 from omnid.stages.front_end import FrontEnd
@@ -64,10 +63,6 @@ class Moment:
 Request: TypeAlias = Setpoint | Literal["arm", "stop", "end"] | NavigationRequest
 # Sends requests as a person or a program would; called once for every pair of images.
 Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
-Takes: TypeAlias = Callable[[Tick, TickReport], None]
-Reports: TypeAlias = Callable[[float, str], None]
-# Makes the robot by its world, its description, the settings and the seed; `Vehicle`, or one with faults.
-MakeVehicle: TypeAlias = Callable[[World, SimulatedRobot, Config, int, Takes, Reports], Vehicle]
 
 
 class EstimatedPose(NamedTuple):
@@ -93,11 +88,6 @@ class SimulatedRun:
     places: list[PlaceUpdate] = field(default_factory=list)
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
-        """The stamps (N,) of the poses."""
-        return np.array([pose.stamp_ns for pose in self.poses], np.int64)
-
-    @property
     def T_world_base(self) -> Array:
         """The true poses (N, 4, 4)."""
         return np.array([pose.T_world_base for pose in self.poses]).reshape(-1, 4, 4)
@@ -108,16 +98,6 @@ class SimulatedRun:
         return np.array([pose.T_odom_base for pose in self.poses]).reshape(-1, 4, 4)
 
     @property
-    def states(self) -> list[str]:
-        """The tracking states of the poses."""
-        return [pose.state for pose in self.poses]
-
-    @property
-    def slipping(self) -> NDArray[np.bool_]:
-        """The poses (N,) with which the daemon reports that the wheels slip."""
-        return np.array([pose.is_slipping for pose in self.poses], bool)
-
-    @property
     def truth_in_odom(self) -> Array:
         """The true poses (N, 4, 4) in odom."""
         return np.asarray(se3.inverse(self.T_world_base[:1]) @ self.T_world_base)
@@ -125,12 +105,8 @@ class SimulatedRun:
     @property
     def contacts(self) -> list[Tick]:
         """The first tick of each contact with an obstacle."""
-        before = [None, *self.ticks]
-        return [
-            tick
-            for tick, last in zip(self.ticks, before, strict=False)
-            if tick.clearance_m <= 0 and (last is None or last.clearance_m > 0)
-        ]
+        touches = np.array([False, *(tick.clearance_m <= 0 for tick in self.ticks)])
+        return [self.ticks[at] for at in np.flatnonzero(touches[1:] & ~touches[:-1])]
 
     @property
     def clearance_m(self) -> float:
@@ -146,16 +122,16 @@ def simulate(
     seconds: float,
     seed: int = 0,
     config: Config | None = None,
-    vehicle: MakeVehicle = Vehicle,
+    vehicle: Callable[..., Vehicle] = Vehicle,
 ) -> SimulatedRun:
     """Drive for a number of seconds of simulated time and return the run.
 
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
-    where there is one. Raises OmnidError as `omnid run` does.
+    where there is one. Raises OmnidError as `omnid run` does. vehicle: makes the robot; `Vehicle`, or one with faults.
     """
     prepare_kernels(nothing)
     # 1. The robot, and the lists of what it does.
-    config, rig = config or Config(), with_masks(robot.rig)
+    config, rig = config or Config(), robot.rig
     run, truth = SimulatedRun(rig.T_base_rig), dict[int, Array]()  # T_world_base by the stamp of a pair [ns]
     body = vehicle(
         world,

@@ -1,18 +1,45 @@
-"""A simulated robot: its cameras and sensors, and how its wheels move it over the ground."""
+"""A robot in simulated time: x(k+1) = f(x(k), u(k), dt) of its body, with its cameras and the real controller.
+
+Time passes from pair to pair of images, with the ticks of the controller between them. Before the tick at a pair time
+stops until the images of the pair before have been answered: `wait` of `Vehicle.pairs`. In lock-step the stages
+run inline, so nothing is waited for. A daemon in other threads is waited for, so that a busy computer slows the robot
+down and changes nothing else: poses take longer than a tick to the wheels, so that the next pair can be rendered while
+the daemon works on the last.
+"""
 
 from __future__ import annotations
 
+import heapq
+import math
+import random
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Final
+from itertools import count
+from queue import SimpleQueue
+from typing import ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from calib import se3
-from calib.models.camera import Mask
+from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from drivers.motors.simulated_motor import MotionLimits
-from omnid.simulation.rendering.sensor import Sensor
+from drivers.frame import CAMERAS, Camera, Frame
+from drivers.motion import GyroSample, MotionSample, WheelSample
+from drivers.motor import VelocityCommand
+from drivers.motors.simulated_motor import MotionLimits, Pose, SimulatedMotor
+from omnid.config import Config
+from omnid.controller.controller import Controller
+from omnid.controller.statistics import TickReport
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerScan
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.contacts import ContactState
+from omnid.core.control.control_law import ControlInput, ControllerPose
+from omnid.simulation.rendering.ray_caster import render_grey
+from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
+from omnid.simulation.rendering.surfaces import Scene
+from omnid.simulation.world import Walkers, World, clearance_m
 
 CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.
 BASELINE_M: Final = 0.2
@@ -39,15 +66,6 @@ class WheelErrors:
     noise: float = 0.002  # standard deviation of the travel of each wheel, per root of a metre [m]
 
 
-@dataclass(frozen=True, slots=True)
-class GyroErrors:
-    """Bias about base x, y, z, and noise of a sample, rad/s."""
-
-    bias_radps: tuple[float, float, float] = (0.004, -0.003, 0.006)
-    noise_radps: float = 0.003
-    rate_hz: float = 100.0
-
-
 @dataclass(frozen=True)
 class SimulatedRobot:
     """A disc with two driven wheels and two cameras; the motor controller is that of the configuration."""
@@ -58,7 +76,9 @@ class SimulatedRobot:
     height_m: float = 1.2
     limits: MotionLimits = field(default_factory=lambda: MotionLimits(acceleration_mps2=1.5, lag_s=0.06))
     wheels: WheelErrors = WheelErrors()
-    gyro: GyroErrors = GyroErrors()
+    gyro_bias_radps: tuple[float, float, float] = (0.004, -0.003, 0.006)  # about base x, y, z
+    gyro_noise_radps: float = 0.003  # standard deviation of a sample
+    gyro_hz: float = 100.0
     has_odometry: bool = True  # the daemon is given what the motor controller reports of its wheels
     has_gyro: bool = True
     rate_hz: float = 10.0  # of the cameras
@@ -67,9 +87,13 @@ class SimulatedRobot:
 
 
 def make_robot(size_px: int = IMAGE_PX, rig: Rig | None = None) -> SimulatedRobot:
-    """Return the default robot with images of that size before straight parabolic mirrors, or with another rig."""
+    """Return the default robot with images of that size before straight parabolic mirrors, or with another rig.
+
+    A camera of that rig without a mask is given one, of the whole image.
+    """
     if rig is not None:
-        return SimulatedRobot(rig)
+        lower, upper = (replace(mounted, mask=mounted.visible) for mounted in (rig.lower, rig.upper))
+        return SimulatedRobot(replace(rig, lower=lower, upper=upper))
     focal_px, centre = HORIZON * size_px, ((size_px - 1) / 2, (size_px - 1) / 2)
     camera = UnifiedCamera(1.0, (-focal_px, focal_px), centre, (size_px, size_px))
     lower, upper = (
@@ -81,7 +105,210 @@ def make_robot(size_px: int = IMAGE_PX, rig: Rig | None = None) -> SimulatedRobo
     return SimulatedRobot(Rig(lower, upper, se3.transform(np.eye(3), [0.0, 0.0, CAMERA_HEIGHT_M]), TOPICS))
 
 
-def with_masks(rig: Rig) -> Rig:
-    """Return the rig with a mask of each camera: the whole image where none is known."""
-    lower, upper = (replace(mounted, mask=mounted.visible) for mounted in (rig.lower, rig.upper))
-    return replace(rig, lower=lower, upper=upper)
+class SimulatedCameras:
+    """Renders raw grey frames; an image follows from world, people, pose, sequence number and seed alone."""
+
+    def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int, samples: int) -> None:
+        """samples: per pixel and axis."""
+        self.world, self.samples, self._seed = world, samples, seed
+        self.mounted = {"lower": rig.lower, "upper": rig.upper}
+        self._sensors = {
+            name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
+            for name, mounted in self.mounted.items()
+        }
+
+    def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers) -> Frame:
+        """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
+        ideal = self.ideal(camera, T_world_rig, people) * np.float32(self.world.light_at(people.time_s))
+        rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
+        width, height = self.mounted[camera].camera.size
+        sensor = self._sensors[camera]
+        image = sensor.expose(ideal, rng)
+        if sensor.sensor.is_compressed:
+            return Frame(seq, stamp_ns, camera, "jpeg", sensor.jpeg(image), width, height)
+        return Frame(seq, stamp_ns, camera, "mono8", image, width, height)
+
+    def ideal(self, camera: Camera, T_world_rig: Array, people: Walkers) -> Floats:
+        """Return the image (H, W) without the errors of a sensor."""
+        scene = Scene((*self.world.standing, *people.faces()))
+        return render_grey(scene, self.mounted[camera], T_world_rig, self.samples)
+
+
+START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
+STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.
+# What a controller is given; a stop disarms.
+Given: TypeAlias = ControlInput | ContactState | Literal["stop"]
+
+
+class Tick(NamedTuple):
+    """The truth at a tick of the controller."""
+
+    time_s: float  # since the start
+    pose: Pose  # of the base in the world
+    command: VelocityCommand | None  # that was sent; None where the motor controller did not answer
+    reason: str  # why the wheels must stop; empty where they may turn
+    clearance_m: float  # of the robot's outline; 0 or less: contact
+
+
+class Exposure(NamedTuple):
+    """What the sensors give at a time: a pair of images, and wheels and gyro since the pair before."""
+
+    stamp_ns: int
+    frames: list[Frame]
+    samples: list[MotionSample]
+
+
+class Vehicle:
+    """The robot. Messages to the controller arrive at their times, in order.
+
+    What a subclass may change of it are `images`, `move` and `travel_m`: cameras that fail, pushes, wheels that slip.
+    """
+
+    make_cameras: ClassVar[type[SimulatedCameras]] = SimulatedCameras
+
+    def __init__(
+        self,
+        world: World,
+        robot: SimulatedRobot,
+        config: Config,
+        seed: int,
+        take_tick: Callable[[Tick, TickReport], None],
+        report: Callable[[float, str], None],
+        start_ns: int = START_NS,
+    ) -> None:
+        """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s]."""
+        self.world, self.robot, self.people = world, robot, Walkers(world.people)
+        self.now_ns = self._start_ns = self._tick_ns = self._gyro_ns = start_ns
+        self._take_tick = take_tick
+        self.cameras = self.make_cameras(robot.rig, robot.sensor, world, seed, robot.samples)
+        drive = config.motor.drive
+        self.motor = SimulatedMotor(drive, config.motor.watchdog_ms, lambda: self.now_ns)
+        self.base = self.motor.base
+        self.base.pose, self.base.limits, self.base.traction = world.start, robot.limits, self.travel_m
+        self.controller = Controller(
+            self.motor,
+            # Where no obstacles are searched there is no collision monitor.
+            config.controller if config.obstacles.enabled else config.controller.without_obstacles,
+            1.0 / config.motor.rate_hz,
+            lambda line: report(self.time_s, line),
+            clock_ns=lambda: self.now_ns,
+            limited=drive.limited,
+        )
+        self._period_ns = round(1e9 / config.motor.rate_hz)
+        self._posted: SimpleQueue[tuple[int, int, Given]] = SimpleQueue()  # when it is due [ns], number
+        self._waiting: list[tuple[int, int, Given]] = []
+        self._numbers, self._arrived_ns = count(), 0
+        self._wheel_noise, self._gyro_noise = random.Random(seed), random.Random(seed + 1)
+        self.samples: list[MotionSample] = []  # since the last pair
+        self._obstacles = world.obstacles(robot.height_m)
+
+    @property
+    def time_s(self) -> float:
+        """Return the time since the start."""
+        return (self.now_ns - self._start_ns) * 1e-9
+
+    @property
+    def T_world_base(self) -> Array:
+        """Return the true pose (4, 4) of the base."""
+        return self.world.T_world_base(self.base.pose)
+
+    @property
+    def T_world_rig(self) -> Array:
+        """Return the true pose (4, 4) of the rig."""
+        return self.T_world_base @ self.robot.rig.T_base_rig
+
+    def post(self, given: Given, due_ns: int = 0) -> None:
+        """Have the controller given something before its first tick at or after a time; from any thread.
+
+        A pose or an obstacle scan needs the robot's pose_delay_s from its images. It is on its way when `advance` is
+        called next. A setpoint or a request without a time of arrival arrives then.
+        """
+        if isinstance(given, ControllerPose | ControllerScan):
+            due_ns = given.stamp_ns + round(self.robot.pose_delay_s * 1e9)
+        self._posted.put((due_ns, next(self._numbers), given))
+
+    def pairs(self, wait: Callable[[], object]) -> Iterator[Exposure]:
+        """Yield pair after pair. wait: returns when the messages that follow from the pairs before have been posted."""
+        for seq in count():
+            # 1. The body moves by what the controller knows; the images show it there.
+            stamp_ns = self._start_ns + round(seq * 1e9 / self.robot.rate_hz)
+            self.advance(stamp_ns, ticks_then=False)
+            frames = self.images(seq, stamp_ns)
+            # 2. What has been answered meanwhile takes effect with the tick of now.
+            wait()
+            self.advance(stamp_ns)
+            samples, self.samples = self.samples, []
+            yield Exposure(stamp_ns, frames, samples)
+
+    def images(self, seq: int, stamp_ns: int) -> list[Frame]:
+        """Return the frames of the cameras now."""
+        T_world_rig = self.T_world_rig
+        return [self.cameras.frame(camera, seq, stamp_ns, T_world_rig, self.people) for camera in CAMERAS]
+
+    def advance(self, until_ns: int, *, ticks_then: bool = True) -> None:
+        """Advance to a time, with all ticks and samples that are due until then.
+
+        ticks_then: those that are due just then, too; otherwise the next call gives them.
+        """
+        while not self._posted.empty():
+            heapq.heappush(self._waiting, self._posted.get())
+        while (due_ns := min(self._tick_ns, self._gyro_ns)) < until_ns + ticks_then:
+            self._pass(due_ns)
+            if due_ns == self._gyro_ns:
+                self._gyro_ns += round(1e9 / self.robot.gyro_hz)
+            if due_ns == self._tick_ns:
+                while self._waiting and self._waiting[0][0] <= self.now_ns:
+                    self._give(heapq.heappop(self._waiting)[2])
+                self._tick()
+                self._tick_ns += self._period_ns
+        self._pass(until_ns)
+
+    def come_to_rest(self) -> None:
+        """Have the controller stop the wheels permanently."""
+        self.controller.end()
+        self.advance(self.now_ns + STOPPING_NS)
+
+    def move(self, dt_s: float) -> None:
+        """Move the base by its wheels until now, for a time."""
+        self.motor.advance()
+
+    def travel_m(self, dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
+        """Return the travel of the left and the right wheel over the ground for that of their rims in a time."""
+        wheels, noise = self.robot.wheels, self._wheel_noise.gauss
+        left_m, right_m = (
+            travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * noise(0.0, 1.0)
+            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right))
+        )
+        return left_m, right_m
+
+    def _give(self, given: Given) -> None:
+        """Give the controller something, which arrives after what it was given before, and after the tick before."""
+        self._arrived_ns = max(self._arrived_ns, self._tick_ns - self._period_ns) + 1
+        if given == "stop":
+            self.controller.stop(self._arrived_ns)
+        elif isinstance(given, ContactState):
+            self.controller.touch(given)
+        elif isinstance(given, TimedSetpoint | ArmRequest) and not given.arrival_ns:
+            self.controller.take(given._replace(arrival_ns=self._arrived_ns))
+        else:
+            self.controller.take(given)
+
+    def _pass(self, until_ns: int) -> None:
+        """Let the time until a stamp pass: the base moves, the gyro gives the mean of its turn, people walk."""
+        before, dt_s = self.base.pose, (until_ns - self.now_ns) * 1e-9
+        self.now_ns = until_ns
+        self.move(dt_s)
+        if self.robot.has_gyro and dt_s > 0.0:
+            turned_radps = self.world.turned_rad(before, self.base.pose) / dt_s
+            noise = (self.robot.gyro_noise_radps * self._gyro_noise.gauss(0.0, 1.0) for _ in range(3))
+            parts = zip(self.robot.gyro_bias_radps, noise, turned_radps.tolist(), strict=True)
+            self.samples.append(GyroSample(self.now_ns, *(bias + one + turned for bias, one, turned in parts)))
+        self.people.advance(self.time_s, self.base.pose[:2])
+
+    def _tick(self) -> None:
+        report, status, pose = self.controller.tick(), self.motor.status, self.base.pose
+        if self.robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
+            self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
+        walking = self.world.footprints(self.people.faces(), self.robot.height_m)
+        nearest_m = min(clearance_m(one, pose[:2], self.robot.radius_m) for one in (self._obstacles, walking))
+        self._take_tick(Tick(self.time_s, pose, report.command, report.state.reason, nearest_m), report)

@@ -29,10 +29,9 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.navigation_state import NavigationState
-from omnid.simulation.demonstration import ANSWER_S, cross_track_m
+from omnid.simulation.demonstration import cross_track_m
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
-from omnid.simulation.robot import make_robot
-from omnid.simulation.vehicle import START_NS
+from omnid.simulation.robot import START_NS, make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import WorldOptions, load_world
 from omnid.tracking_state import MapState
@@ -40,6 +39,7 @@ from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation.disturbed import Fault, Slip, disturbed, simulate
 
 Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
+ANSWER_S = 0.5  # after a request, within which no end of its drive is looked for
 NOTICED_LATE_S = 0.5  # after its end, within which slip may be noticed
 
 
@@ -131,7 +131,7 @@ def row(case: Case, driven: SimulatedRun) -> list[Cell]:
 
 def dark(case: Case, driven: SimulatedRun) -> str:
     """Return way [m] and error [cm] of the poses of the time in the dark, from the last pair before it on."""
-    times_s = (driven.stamps_ns - START_NS) * 1e-9
+    times_s = np.array([pose.stamp_ns - START_NS for pose in driven.poses]) * 1e-9
     texts = []
     for fault in case.faults:
         first, last = np.searchsorted(times_s, (fault.start_s, fault.end_s)) - 1
@@ -146,14 +146,15 @@ def dark(case: Case, driven: SimulatedRun) -> str:
 
 def slip(case: Case, driven: SimulatedRun) -> str:
     """Return when slip was noticed after it began [s], and how many pairs noticed it at other times."""
-    times_s = (driven.stamps_ns - START_NS) * 1e-9
+    times_s = np.array([pose.stamp_ns - START_NS for pose in driven.poses]) * 1e-9
+    slipping = np.array([pose.is_slipping for pose in driven.poses], bool)
     at_slips, texts = np.zeros(len(times_s), bool), []
     for slipped in case.slips:
         within = (times_s >= slipped.start_s) & (times_s < slipped.end_s + NOTICED_LATE_S)
-        noticed_s = times_s[within & driven.slipping]
+        noticed_s = times_s[within & slipping]
         texts.append(f"{noticed_s[0] - slipped.start_s:.1f} s" if len(noticed_s) else "not noticed")
         at_slips |= within
-    return "; ".join([*texts, str(int((driven.slipping & ~at_slips).sum()))])
+    return "; ".join([*texts, str(int((slipping & ~at_slips).sum()))])
 
 
 def goals(
@@ -170,7 +171,7 @@ def goals(
             robot = disturbed(make_robot(size), slips=case.slips, has_odometry=case.sensors, has_gyro=case.sensors)
             started_s, script = time.process_time(), Goals(case.goals)
             driven = simulate(case.world(seed), robot, script, seconds=case.seconds, seed=seed, faults=case.faults)
-            spent_s = (time.process_time() - started_s) / max(1, len(driven.stamps_ns))
+            spent_s = (time.process_time() - started_s) / max(1, len(driven.poses))
             table.add(name, seed, *row(case, driven), spent_s, seed=(f"drive {name}", seed))
 
 

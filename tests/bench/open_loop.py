@@ -30,7 +30,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.grid import FloorGrid
 from omnid.simulation.lockstep import Moment, Request
-from omnid.simulation.vehicle import START_NS
+from omnid.simulation.robot import START_NS
 from omnid.simulation.world import Walkers, clearance_m
 from tests.bench.obstacles import Planned, prepared, settings_for
 from tests.bench.results import ResultTable, columns

@@ -20,8 +20,7 @@ from omnid.simulation import lockstep
 from omnid.simulation.lockstep import Drive, SimulatedRun
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.simulation.robot import SimulatedRobot
-from omnid.simulation.vehicle import SimulatedCameras, Vehicle
+from omnid.simulation.robot import SimulatedCameras, SimulatedRobot, Vehicle
 from omnid.simulation.world import Walkers, World, footprints
 from tests.simulation.disturbances import Mirror, seen_part
 

@@ -115,7 +115,7 @@ def test_a_base_stops_within_a_second_where_half_of_the_images_freezes_ahead() -
     assert speeds[-20:].max() < 1e-4
     # Landmarks in the dead half would say that the base stands.
     np.testing.assert_allclose(run.T_odom_base[-1, :2, 3], run.truth_in_odom[-1, :2, 3], atol=0.03)
-    assert set(run.states[5:]) <= {"tracking", "degraded"}
+    assert {pose.state for pose in run.poses[5:]} <= {"tracking", "degraded"}
 
 
 @pytest.mark.hazard("H22")
@@ -133,7 +133,7 @@ def test_in_the_dark_a_base_stops_although_wheels_carry_its_pose(gyro: bool) -> 
     robot, dark = replace(make_robot(SIZE_PX), samples=1, has_gyro=gyro), Fault("dark", STARTS_S, 9.0)
     run = simulate(world(), robot, ahead, seconds=3.0, seed=1, config=WITHOUT_PLACES, faults=(dark,))
     assert 0.0 < stop_s(run, UNSEEN) < 0.5
-    assert "lost" not in run.states
+    assert "lost" not in {pose.state for pose in run.poses}
 
 
 BOX_M = (1.6, 0.75), (0.4, 0.4, 0.08)  # its middle, and its sides
