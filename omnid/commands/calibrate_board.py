@@ -162,8 +162,6 @@ def live(args: argparse.Namespace) -> int:
                 _show(boards, outcome)
                 if bus is not None and time.monotonic() >= published_s + config.live.status_s:
                     published_s = time.monotonic()
-                    if bus.needs_router:
-                        bus.connect()
                     bus.publish("status", diagnostics_cdr(time.time_ns(), [status(boards, outcome)]))
     HANDLER.show("")
     if missing := boards.missing():

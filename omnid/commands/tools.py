@@ -12,7 +12,7 @@ from omnid.config import FIRST_SETTINGS, Config
 from omnid.errors import OmnidError
 from omnid.monitor.listen import listen as listen_to
 from omnid.settings import changed, dump, dump_minimal, value_at
-from omnid.transport.bus_config import checked
+from omnid.transport.session import zenoh_config
 
 
 @command(SETTINGS)
@@ -36,7 +36,7 @@ def print_config(args: argparse.Namespace) -> int:
         print(dump_minimal(config, FIRST_SETTINGS) if args.minimal else dump(config), end="")
         return 0
     # Words that only the daemon's start would refuse.
-    checked(config.bus)
+    zenoh_config(config.bus)
     motor_protocol(config.motor.protocol)
     paths = changed(config)
     print(f"{args.file}: good; {len(paths)} settings differ from their defaults")

@@ -161,10 +161,10 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         **{key: getattr(state, key) for key in counts},
         **by_reason(status_names.STOPPED_PREFIX, state.stops),
         **by_reason(status_names.IGNORED_PREFIX, state.refused),
-        "commands": commands.accepted,
+        "commands": commands.wheels.accepted,
         "stops": commands.stops,
-        "command_refusal": commands.refusal,  # why the newest refused command was refused
-        **by_reason(status_names.REFUSED_PREFIX, commands.refused),
+        "command_refusal": commands.wheels.refusal,  # why the newest refused command was refused
+        **by_reason(status_names.REFUSED_PREFIX, commands.wheels.refused),
         **times(status_names.CAPTURE_TO_WHEEL, controller.to_wheel),
         **times(status_names.TICK_LATE, late),
         time_key(status_names.TICK_LATE, "p999"): 1e3 * late.p(0.999),

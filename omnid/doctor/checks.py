@@ -27,7 +27,8 @@ from omnid.config import RecordConfig
 from omnid.controller.motor import SIMULATED, MotorSettings
 from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 from omnid.errors import OmnidError
-from omnid.transport.bus_config import BusConfig, checked
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import zenoh_config
 
 Level = Literal["ok", "warning", "error"]
 GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
@@ -206,7 +207,7 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Find
 def bus(config: BusConfig) -> Finding:
     """Check the settings of the bus, and who may send commands."""
     try:
-        checked(config)
+        zenoh_config(config)
     except OmnidError as fault:
         return Finding("error", "bus", str(fault), "the daemon does not start with these settings")
     endpoints = ", ".join(endpoint for endpoint in (*config.listen, *config.connect) if not _is_local(endpoint))

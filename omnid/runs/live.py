@@ -36,6 +36,7 @@ from omnid.engine.telemetry import Histogram
 from omnid.engine.threads import started
 from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure import ExposureControl, UsefulArea
+from omnid.messages import SaveMap
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
@@ -52,11 +53,13 @@ from omnid.transport import status_names as names
 from omnid.transport import topics
 from omnid.transport.bus import Bus
 from omnid.transport.codec import compile_serialisers
-from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
+from omnid.transport.commands import CommandReceiver, Freshness
+from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.topics import Answer, Request
 
 NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
 NO_PLANNER: Final = f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off"
+NO_SAMPLES: Final = "it is not used, see motion.wheels, motion.wheel_joints and motion.imu"
 NO_MAP_FILE: Final = (
     "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
     "without --localize-only"
@@ -311,7 +314,7 @@ def _subscribe(
     run_places: RunPlaces,
     front_end: FrontEnd,
 ) -> dict[str, Callable[[], names.Stats]]:
-    """Begin to receive, without a motor only samples and requests to save the map; return the numbers of receivers."""
+    """Begin to receive; without a motor all but samples and requests to save the map is refused. Return the numbers."""
     config, clock, warn = session.config, session.clock, session.warn
     sources, joints = config.controller.sources.names, joint_wheels(config)
     # 1. Samples of gyro and wheels, unless they come with the images of a log or of a simulation, whose motion others
@@ -321,7 +324,6 @@ def _subscribe(
         sensors.add(topics.IMU)
     if config.motion.wheels != "off" and not robot.brings_samples and controller is None:
         sensors.add(topics.JOINT_STATES if joints else topics.WHEEL_ODOM)
-    samples = SensorReceiver(front_end.pairing.motion.add, clock.stamp_ns, frozenset(sensors), warn, joints)
     # 2. Commands and requests.
     freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))
     bus.serve(topics.TIME, freshness.own_time)
@@ -329,28 +331,33 @@ def _subscribe(
     def ask(command: NavigationCommand) -> None:
         requests.put(command._replace(stop_count=controller.statistics.state.stop_count if controller else 0))
 
-    received = NavigationReceiver(ask, freshness, report=warn)
-    taken = {topic: topics.command_of(topic).schema for topic in (*topics.SENSOR_TOPICS, topics.MAP)}
-    table: dict[str, Callable[[Request], Answer | None]] = {}
+    taken, saves = topics.command_topics(sources), run_places.requests
+    why_not = dict.fromkeys(topics.NAVIGATION_TOPICS, NO_PLANNER) if controller else dict.fromkeys(taken, NO_MOTOR)
+    why_not |= {topics.MAP: NO_MAP_FILE, **dict.fromkeys(topics.SENSOR_TOPICS, NO_SAMPLES)}
+    commands = CommandReceiver(
+        freshness,
+        controller=controller,
+        sources=sources,
+        is_unique=lambda: bus.is_unique,
+        navigate=ask if controller is not None and PLANNER in sources else None,
+        save_map=None if saves is None else lambda id: saves.push(SaveMap(id)),
+        take_sample=front_end.pairing.motion.add,
+        decode_sample=partial(sample_from_cdr, stamp_ns=clock.stamp_ns, joints=joints),
+        sensors=sensors,
+        why_not=why_not,
+        report=warn,
+    )
     stats: dict[str, Callable[[], names.Stats]] = {
-        names.MOTION: lambda: front_end.motion_stats() | names.by_reason(names.REFUSED_PREFIX, samples.refused)
+        names.MOTION: lambda: front_end.motion_stats() | names.by_reason(names.REFUSED_PREFIX, commands.samples.refused)
     }
-    if controller is None:
-        commands: Callable[[Request], Answer | None] = lambda _: Answer(False, NO_MOTOR)  # noqa: E731
-    else:
-        taken = topics.command_topics(sources)
-        drive = CommandReceiver(controller, freshness, sources=sources, is_unique=lambda: bus.is_unique, report=warn)
-        commands = drive.receive  # which counts unknown topics
-        without_planner = Answer(False, NO_PLANNER)
-        navigate = received.receive if PLANNER in sources else lambda _: without_planner
-        table = dict.fromkeys(topics.NAVIGATION_TOPICS, navigate)
-        stats |= {names.WHEELS: partial(wheel_stats, controller.statistics, drive), names.REQUESTS: received.stats}
-    table |= dict.fromkeys(topics.SENSOR_TOPICS, samples.receive)
-    table[topics.MAP] = run_places.receive if run_places.requests else lambda _: Answer(False, NO_MAP_FILE)
+    if controller is not None:
+        stats |= {
+            names.WHEELS: partial(wheel_stats, controller.statistics, commands),
+            names.REQUESTS: commands.requests.stats,
+        }
 
     def receive(request: Request) -> None:
-        answer = table.get(request.topic, commands)(request)
-        if answer is not None:
+        if (answer := commands.receive(request)) is not None:
             bus.answer(request.id, answer)
 
     def is_stopped() -> bool:

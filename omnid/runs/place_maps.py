@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -21,8 +20,7 @@ from omnid.formats.place_file import read_places, write_places
 from omnid.messages import MapCopy, PlaceUpdate, SaveMap
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
-from omnid.transport.codec import string_from_cdr
-from omnid.transport.topics import SAVE_MAP, Answer, Request
+from omnid.transport.topics import Answer
 
 
 class RunPlaces:
@@ -71,7 +69,7 @@ class RunPlaces:
         self._saved = frozenset[int]()  # keyframes in the file
         self._seen: MapCopy | None = None
         self._was_elsewhere = False  # whether the user was asked if the place is another one
-        self._counts = {"saves": 0, "failed": 0, "refused": 0}
+        self._counts = {"saves": 0, "failed": 0}
         self._error = ""  # of the last save; empty: it succeeded
 
     def save_now_and_then(
@@ -82,15 +80,6 @@ class RunPlaces:
         answer: takes the id of a request; a second call for it does nothing.
         """
         self.copy_s, self.requests, self._answer = every_s, requests, answer
-
-    def receive(self, request: Request) -> Answer | None:
-        """Take a request from the bus, a String "save", from any thread; return the refusal of any other."""
-        with suppress(OmnidError):
-            if self.requests and string_from_cdr(request.payload) == SAVE_MAP:
-                self.requests.push(SaveMap(request.id))
-                return None
-        self._counts["refused"] += 1
-        return Answer(False, f'a String "{SAVE_MAP}" was expected')
 
     def process(self, update: PlaceUpdate) -> None:
         """Write the copy of the map that comes with a pose, if it is a new one."""

@@ -35,7 +35,7 @@ from omnid.sinks.encoder import Encoder, UnixTime
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
-BUS_S: Final = 3.0  # Time between two attempts to reach a router for the first time, and until a bus must be closed.
+BUS_S: Final = 3.0  # Time until a bus must be closed.
 CLOUD_POINTS: Final = 50_000  # Most points of the map, the most confident ones, in one message.
 
 
@@ -121,8 +121,6 @@ class Session:
         self.outputs.callback(self._close_bus, bus)
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
-        if bus.needs_router:
-            self.graph.ticker("router", BUS_S, bus.connect)
         return bus
 
     def _close_bus(self, bus: Bus) -> None:

@@ -19,8 +19,8 @@ from zenoh import ext
 from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
-from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.intake import PERIOD_S, CommandIntake, Intake, OpenRequests, RequestCallback, burst_of
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.intake import PERIOD_S, CommandIntake, OpenRequests, Ring
 from omnid.transport.session import ALIVE, has_receiver, open_session, reason
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import ARM, CLOCK, PUBLISHED, STOP, Request, Topic, command_of, plain_key, ros_name
@@ -85,62 +85,44 @@ def _declared_publisher(
 
 
 class Bus:
-    """An open zenoh session. Remote endpoints may come and go; local endpoints must be free."""
+    """An open zenoh session. Remote endpoints may come and go, but the router of a client is there at the start."""
 
     def __init__(
         self, config: BusConfig, warn: Callable[[str], None] = lambda _: None, *, gives_time: bool = False
     ) -> None:
-        """Open the session, or that of a client with the first `connect`. gives_time: there is a topic /clock.
+        """Open the session. gives_time: there is a topic /clock.
 
-        Raise OmnidError for a wrong configuration. Each time that the name is no longer unique, warn is called, and the
-        subscriber of commands receives a stop.
+        Raise OmnidError for a wrong configuration, and where the router of a client cannot be reached. Each time that
+        the name is no longer unique, warn is called, and the subscriber of commands receives a stop.
         """
-        self._config, self._warn = checked(config), warn
-        # A robot whose time is the computer's has none: programs that wait for it would believe to be in a simulation.
-        self._topics = {name: topic for name, topic in PUBLISHED.items() if gives_time or name != CLOCK}
+        self._config, self._warn, self._closed = config, warn, False
+        self._session = session = open_session(config)
+        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._namesakes: set[str] = set()  # liveliness tokens of other robots of this name
-        self._session: zenoh.Session | None = None
-        self._publishers: dict[str, TopicPublisher] = {}
+        self._on_command: Callable[[Request], None] | None = None
+        self._watch_for_namesakes()
+        # A robot whose time is the computer's has none: programs that wait for it would believe to be in a simulation.
+        topics = [name for name in PUBLISHED if gives_time or name != CLOCK]
+        self._node = ros2.RosNode(session, config.robot, config.ros2_domain, is_on=config.ros2 != "off")
+        self._publishers = {name: TopicPublisher(session, config, name, self._node) for name in topics}
         self._newest: dict[str, tuple[bytes, bytes | None]] = {}  # payload and attachment of latched topics
         self._texts: dict[str, str | Callable[[], str]] = {}  # answers to queries, by name
-        self._on_command: RequestCallback | None = None
+        self._queries = {name: self._queryable(name) for name in topics if PUBLISHED[name].latched}
         self._requests = OpenRequests()
         self.answer = self._requests.answer  # answers a request; nothing happens where no query waits for it
-        self._command_topics: Mapping[str, str] = {}
-        self._is_stopped: Callable[[], bool] = lambda: False
-        self._stop_listener: StopListener | None = None
-        self._node: ros2.RosNode | None = None
-        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._commands: CommandIntake | None = None
-        self._queries: dict[str, Intake[zenoh.Query]] = {}  # by name
-        self._pollers: list[Poller] = []
+        self._stop_listener: StopListener | None = None
         self._flooded = 0  # floods at the last status
-        self._closed = False
-        if not self.needs_router:
-            self._open()
-
-    @property
-    def needs_router(self) -> bool:
-        """True for a client, whose `connect` must be called from time to time."""
-        return self._config.is_client
-
-    def connect(self) -> None:
-        """Try once to reach the router, unless it was reached before: zenoh reconnects by itself only after that."""
-        if self._session is None and not self._closed:
-            with suppress(OmnidError):  # the configuration has been checked, so the router is not there yet
-                self._open()
+        self._pollers = [Poller(self._answer_queries, QUERY_PERIOD_S, "bus queries")]
 
     def stats(self) -> dict[str, object]:
-        """Return whether the bus is open, the name unique, and how often others sent too much."""
-        intakes = [*(self._commands.intakes if self._commands else ()), *self._queries.values()]
-        before, self._flooded = self._flooded, sum(intake.floods for intake in intakes)
+        """Return whether the name is unique, and how often others sent too much."""
+        rings = [*(self._commands.rings if self._commands else ()), *self._queries.values()]
+        before, self._flooded = self._flooded, sum(ring.floods for ring in rings)
         warning = ""
-        if self._session is None:
-            warning = f"no router yet at {', '.join(self._config.connect)}"
-        elif self._flooded > before:
-            warning = f"more messages on {max(intakes, key=attrgetter('floods')).key} than are taken: end their sender"
+        if self._flooded > before:
+            warning = f"more messages on {max(rings, key=attrgetter('floods')).key} than are taken: end their sender"
         return {
-            "mode": "client" if self._config.is_client else "peer",
             "same_name": len(self._namesakes),  # other robots of this name
             "floods": self._flooded,  # how often a key had more messages than its budget
             "_error": "" if self.is_unique else self._same_name,
@@ -158,10 +140,8 @@ class Bus:
 
         attachment: zenoh attachment for subscribers that know omnid. A topic with a leading '/' has no robot's name.
         """
-        if self._topics[topic].latched:
+        if PUBLISHED[topic].latched:
             self._newest[topic] = (payload, attachment)
-        if self._session is None:
-            return
         try:
             self._publishers[topic].put(payload, attachment)
         except zenoh.ZError as error:
@@ -169,40 +149,47 @@ class Bus:
 
     def is_received(self, topic: str) -> bool:
         """True if a topic has a subscriber."""
-        return self._session is not None and self._publishers[topic].is_received
+        return self._publishers[topic].is_received
 
     def serve(self, name: str, text: str | Callable[[], str]) -> None:
-        """Answer queries for `<robot>/<name>` with a text, such as the configuration, or with that of the moment.
-
-        A second call replaces the first.
-        """
-        is_new = name not in self._texts
+        """Answer queries for `<robot>/<name>` with a text, such as the configuration, or with that of the moment."""
         self._texts[name] = text
-        if is_new and self._session is not None:
-            self._declare_queryable(self._session, name)
+        self._queries[name] = self._queryable(name)
 
     def subscribe_commands(
-        self, callback: RequestCallback, topics: Mapping[str, str], is_stopped: Callable[[], bool] = lambda: False
+        self,
+        callback: Callable[[Request], None],
+        topics: Mapping[str, str],
+        is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """Call callback for messages on `<robot>/cmd/...` and queries that ask the same, in a thread of the bus.
 
         topics: with their types, each with a budget of its own; what exceeds it is dropped and counted.
         is_stopped: True if a stop holds, which confirms stops that come as datagrams; they are passed on as others.
         """
-        self._on_command, self._command_topics, self._is_stopped = callback, topics, is_stopped
-        if self._session is not None:
-            self._declare_subscribers(self._session, callback)
+        self._on_command = callback
+        if not self.is_unique:
+            callback(Request(STOP))
+        self._commands = CommandIntake(self._session, self._config, topics, self._requests, callback)
+        self._stop_listener = StopListener(self._config, lambda: callback(Request(STOP)), is_stopped)
+        self._pollers += [
+            Poller(self._commands.process, PERIOD_S, "bus commands"),
+            Poller(self._stop_listener.process, PERIOD_S, "stop datagrams"),
+        ]
+        for name, schema in topics.items():
+            self._node.subscription(name, schema)
 
     def close(self) -> None:
         """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""
+        if self._closed:
+            return
+        self._closed = True
         for poller in self._pollers:
             poller.close()
         if self._stop_listener is not None:
             self._stop_listener.close()
-        if not self._closed and self._session is not None:
-            with suppress(zenoh.ZError):  # raised for such a subscriber; nothing of ours is lost
-                self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
-        self._closed = True
+        with suppress(zenoh.ZError):  # raised for such a subscriber; nothing of ours is lost
+            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 
     @property
     def _same_name(self) -> str:
@@ -211,25 +198,9 @@ class Bus:
             "one is not armed before the other has gone; change bus.robot of one of them"
         )
 
-    def _open(self) -> None:
-        session = open_session(self._config)
-        self._watch_for_namesakes(session)
-        config = self._config
-        self._node = node = ros2.RosNode(session, config.robot, config.ros2_domain, is_on=config.ros2 != "off")
-        self._publishers = {name: TopicPublisher(session, config, name, node) for name in self._topics}
-        for name in {*self._texts, *(name for name, topic in self._topics.items() if topic.latched)}:
-            self._declare_queryable(session, name)
-        for name, (payload, attached) in self._newest.items():  # published before the router was reached
-            if self._topics[name].transient_local:
-                self._publishers[name].put(payload, attached)
-        if self._on_command is not None:
-            self._declare_subscribers(session, self._on_command)
-        self._session = session
-        self._pollers.append(Poller(self._answer_queries, QUERY_PERIOD_S, "bus queries"))
-
-    def _watch_for_namesakes(self, session: zenoh.Session) -> None:
+    def _watch_for_namesakes(self) -> None:
         """Declare the name, and watch for others: they keep this robot from being armed, never from starting."""
-        own = f"{self._config.robot}/{ALIVE}/{session.zid()}"
+        own = f"{self._config.robot}/{ALIVE}/{self._session.zid()}"
 
         def on_token(sample: zenoh.Sample) -> None:
             key, was_unique = str(sample.key_expr), self.is_unique
@@ -243,39 +214,24 @@ class Bus:
                     if self._on_command is not None:
                         self._on_command(Request(STOP))
 
-        tokens = session.liveliness()
+        tokens = self._session.liveliness()
         self._declared += [
             tokens.declare_token(own),
             tokens.declare_subscriber(f"{self._config.robot}/{ALIVE}/*", on_token, history=True),
             tokens.declare_token(f"{self._config.robot}/{ALIVE}"),
         ]
 
-    def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
-        key = plain_key(self._config.robot, name)
+    def _queryable(self, name: str) -> Ring:
         rate_hz = command_of(ARM).rate_hz  # as of requests
-        queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(burst_of(rate_hz)))
-        self._declared.append(queryable)
-        self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, rate_hz)
+        return Ring(self._session.declare_queryable, plain_key(self._config.robot, name), rate_hz)
 
     def _answer_queries(self) -> None:
         """Answer the queries that have come, and the requests that are decided."""
         self._requests.send()
-        for name, intake in list(self._queries.items()):
-            for query in intake.messages():
-                key, text = plain_key(self._config.robot, name), self._texts.get(name)
-                if text is not None:
-                    query.reply(key, text if isinstance(text, str) else text(), encoding=zenoh.Encoding.TEXT_PLAIN)
+        for name, ring in list(self._queries.items()):
+            for query in ring.messages():
+                if (text := self._texts.get(name)) is not None:
+                    query.reply(ring.key, text if isinstance(text, str) else text(), encoding=zenoh.Encoding.TEXT_PLAIN)
                 elif name in self._newest:
                     payload, attachment = self._newest[name]
-                    query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_CDR, attachment=attachment)
-
-    def _declare_subscribers(self, session: zenoh.Session, callback: RequestCallback) -> None:
-        if not self.is_unique:
-            callback(Request(STOP))
-        self._commands = CommandIntake(session, self._config, self._command_topics, self._requests, callback)
-        self._pollers.append(Poller(self._commands.process, PERIOD_S, "bus commands"))
-        self._stop_listener = StopListener(self._config, lambda: callback(Request(STOP)), self._is_stopped)
-        self._pollers.append(Poller(self._stop_listener.process, PERIOD_S, "stop datagrams"))
-        if self._node is not None:
-            for name, schema in self._command_topics.items():
-                self._node.subscription(name, schema)
+                    query.reply(ring.key, payload, encoding=zenoh.Encoding.APPLICATION_CDR, attachment=attachment)

@@ -462,7 +462,6 @@ def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
 
 # Commands and requests.
 
-ASIDE_NAMES: Final = ("linear.y", "linear.z", "angular.x", "angular.y")
 _PLAIN_TWIST_BYTES: Final = calcsize("<4x6d")  # encapsulation header, two vectors
 
 
@@ -473,7 +472,7 @@ class TwistRecord(NamedTuple):
     frame: str
     velocity_mps: float
     yaw_rate_radps: float
-    aside: tuple[float, float, float, float]  # what no base with two driven sides has: see ASIDE_NAMES
+    aside: Mapping[str, float]  # what no base with two driven sides has, by name, such as "linear.y"
 
 
 class PlanarPath(NamedTuple):
@@ -499,7 +498,8 @@ def twist_from_cdr(payload: bytes) -> TwistRecord:
         message = decoded(payload, TWIST_SCHEMA)
         stamp_ns, frame, twist = _stamp_ns(message), message.header.frame_id, message.twist
     linear, angular = twist.linear, twist.angular
-    return TwistRecord(stamp_ns, frame, linear.x, angular.z, (linear.y, linear.z, angular.x, angular.y))
+    aside = {"linear.y": linear.y, "linear.z": linear.z, "angular.x": angular.x, "angular.y": angular.y}
+    return TwistRecord(stamp_ns, frame, linear.x, angular.z, aside)
 
 
 def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:

@@ -1,20 +1,6 @@
-"""What comes from the network, validated: commands and contacts, requests to the navigation, samples; below `cmd`.
+"""What comes from the network, validated: commands and contacts, requests to the navigation, samples.
 
-    twist              geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z rad/s; or a plain Twist,
-                       whose stamp is the time of sending that rmw_zenoh attaches
-    heading            geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad
-    stop               anything
-    arm                std_msgs/msg/Header with the time it was sent
-    bumper, cliff      std_msgs/msg/Bool with the time of sending attached: all but a fresh False is a contact
-    goal, path         geometry_msgs/msg/PoseStamped, nav_msgs/msg/Path in map or odom; a quaternion of zeros asks for
-                       no heading
-    navigation, route  std_msgs/msg/String: "cancel", "pause", "resume"; "teach NAME [replace]", "finish", "repeat NAME
-                       [reverse] [loops=N]", "stop". A String has no stamp of its own: its time of sending is attached,
-                       or it is the last word, stamp=NANOSECONDS
-    wheel_odom, imu, joint_states  nav_msgs/msg/Odometry, Imu, JointState
-
-twist and heading also exist for each source of commands, as cmd/planner/twist. Samples are below `cmd`, too, because
-they move the pose while the cameras show nothing: only programs that may command the robot may write them.
+`topics.COMMANDS` has type and bounds of each topic, `CommandReceiver` its freshness and action.
 
 When was a message sent? One rule (`Freshness`) for all that can begin, resume or release a motion. All times in it are
 the robot's CLOCK_MONOTONIC. A message says when it was sent by
@@ -36,11 +22,13 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Final, Protocol, TypeAlias
+from types import MappingProxyType
+from typing import Final, TypeAlias
 
-from drivers.logs.ros_messages import JointWheels
 from drivers.motion import MotionSample
+from omnid.controller.link import DriveLink
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
@@ -52,7 +40,7 @@ from omnid.engine.robot_clock import RobotClock
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport import codec, topics
-from omnid.transport.sensor_codec import LARGEST_VALUE, sample_from_cdr
+from omnid.transport.sensor_codec import LARGEST_VALUE
 from omnid.transport.status_names import REFUSED_PREFIX, by_reason
 from omnid.transport.topics import Answer, Request
 
@@ -62,10 +50,8 @@ _CLOCKS: Final = (
     "the stamp of the newest odom; controller.deadlines.command_s is the longest age"
 )
 _STAMPED: Final = re.compile(r"(.*\S)\s+stamp=(\d{1,19})\s*", re.DOTALL)
-
-
 Action: TypeAlias = Callable[[Request, int], object]  # takes a message and its arrival, ns of CLOCK_MONOTONIC
-CONTACTS: Final = {topics.BUMPER: BUMPER, topics.CLIFF: CLIFF}  # a message that is refused is one
+CONTACTS: Final = {topics.BUMPER: BUMPER, topics.CLIFF: CLIFF}
 
 
 class Refused(OmnidError):  # noqa: N818 - named after what it reports
@@ -75,41 +61,6 @@ class Refused(OmnidError):  # noqa: N818 - named after what it reports
         """found: what was measured, and the remedy."""
         super().__init__(f"{reason}: {found}" if found else reason)
         self.reason = reason
-
-
-class Receiver:
-    """Handles each message by the action of its topic, counts and reports those that are refused, and never raises.
-
-    It is called from threads of the bus. accepted: number of messages; refused: by reason; refusal: the newest one.
-    """
-
-    def __init__(self, actions: Mapping[str, Action], report: Callable[[str], None] | None, unknown: str) -> None:
-        """report: takes a line for the log where a refusal is another one than before. unknown: advice."""
-        self._actions, self._report, self._advice = actions, report, unknown
-        self.accepted = 0
-        self.refused: Counter[str] = Counter()
-        self.refusal = ""
-
-    def receive(self, request: Request) -> Answer | None:
-        """Handle one message; return the refusal, None where there is none or the target answers."""
-        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids a command
-        try:
-            if (action := self._actions.get(request.topic)) is None:
-                raise Refused("unknown topic", self._advice)
-            if len(request.payload) > (longest := topics.command_of(request.topic).longest):
-                raise Refused("too long", f"{len(request.payload)} bytes, expected at most {longest}")
-            action(request, arrival_ns)
-        except OmnidError as error:
-            self._on_refusal(request.topic)
-            self.refused[error.reason if isinstance(error, Refused) else "malformed"] += 1
-            before, self.refusal = self.refusal, f"a message on {plain(request.topic)} is refused: {error}"
-            if self._report is not None and self.refusal != before:
-                self._report(self.refusal)
-            return Answer(False, str(error))
-        return None
-
-    def _on_refusal(self, topic: str) -> None:
-        """Do what a message that is refused entails."""
 
 
 class Freshness:
@@ -157,102 +108,102 @@ class Freshness:
         return sent_ns
 
 
-# Commands.
+@dataclass(slots=True)
+class MessageCounts:
+    """Numbers of the messages to one part of the robot."""
+
+    accepted: int = 0
+    refused: Counter[str] = field(default_factory=Counter)  # by reason
+    refusal: str = ""  # the newest one
+
+    def stats(self) -> dict[str, object]:
+        """Return how many were accepted, and how many were not valid, by reason."""
+        return {"accepted": self.accepted, **by_reason(REFUSED_PREFIX, self.refused)}
 
 
-def twist_command(payload: bytes) -> tuple[int, Setpoint]:
-    """Return the stamp [ns], 0 without one, of a speed and a yaw rate. Raise OmnidError for anything else."""
-    stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = codec.twist_from_cdr(payload)
-    _check_frame(frame, "base_link")
-    setpoint = Setpoint(_bounded(velocity_mps), None, _bounded(yaw_rate_radps))
-    for name, speed in zip(codec.ASIDE_NAMES, aside, strict=True):
-        if not abs(speed) <= LEAST_SPEED:
-            found = f"twist.{name} = {speed:g}; send linear.x and angular.z only"
-            raise Refused("not possible with a differential drive", found)
-    return stamp_ns, setpoint
+class CommandReceiver:
+    """Handles each message by the action of its topic, counts and reports those that are refused, and never raises.
 
-
-def heading_command(payload: bytes) -> tuple[int, Setpoint]:
-    """Return the stamp [ns] of a speed and a heading in odom. Raise OmnidError for anything else."""
-    stamp_ns, frame, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
-    _check_frame(frame, "odom")
-    return stamp_ns, Setpoint(_bounded(velocity_mps), _bounded(heading_rad))
-
-
-def _bounded(value: float) -> float:
-    """Return a speed or an angle in SI units. Raise Refused where its sender must have meant another unit."""
-    if not math.isfinite(value):
-        raise Refused("not finite")
-    if abs(value) > LARGEST_VALUE:
-        raise Refused("out of range")
-    return value
-
-
-def _check_frame(frame: str, expected: str) -> None:
-    if frame not in ("", expected):
-        raise Refused("wrong frame", f"{frame[:40]!a}, expected {expected} or none")
-
-
-class CommandTarget(Protocol):
-    """The controller; its methods may be called from any thread."""
-
-    def send(self, given: TimedSetpoint | ArmRequest) -> None:
-        """Take a setpoint or a request to arm; its arrival is ns of CLOCK_MONOTONIC."""
-
-    def stop(self) -> None:
-        """Stop the wheels until a request to arm arrives later."""
-
-    def touch(self, contact: str, *, holds: bool) -> None:
-        """Take the state of a bumper or a cliff sensor."""
-
-
-class CommandReceiver(Receiver):
-    """Passes valid commands on. Stops are always obeyed. The controller decides which source and sender drives.
-
-    accepted: setpoints; stops, arms: numbers of them.
+    It is called from threads of the bus. Stops are always obeyed. The controller decides which source and sender
+    drives. wheels (setpoints), requests, samples: numbers of messages; stops: number of them.
     """
 
     def __init__(
         self,
-        target: CommandTarget,
         freshness: Freshness,
         *,
+        controller: DriveLink | None = None,
         sources: Sequence[str] = (OPERATOR, PLANNER),
-        report: Callable[[str], None] | None = None,
         is_unique: Callable[[], bool] = lambda: True,
+        navigate: Callable[[requests.NavigationCommand], None] | None = None,
+        save_map: Callable[[int], object] | None = None,
+        take_sample: Callable[[MotionSample], None] = lambda _: None,
+        decode_sample: Callable[[bytes, str], MotionSample | None] = lambda *_: None,
+        sensors: Collection[str] = (),
+        why_not: Mapping[str, str] = MappingProxyType({}),
+        report: Callable[[str], None] = lambda _: None,
     ) -> None:
         """freshness: the rule for the times of sending.
 
-        sources: names; the first has the short topics cmd/twist and cmd/heading, too. is_unique: False while another
-        robot has this one's name, which is then not armed.
+        controller: None without wheels. sources: names; the first has the short topics cmd/twist and cmd/heading, too.
+        is_unique: False while another robot has this one's name, which is then not armed. navigate: takes requests;
+        None: there is no navigation. save_map: takes the id of a request to save the map; None: it is in no file.
+        take_sample, decode_sample: of the topics in sensors, by bytes and type. why_not: the remedy for topics that
+        have no action. report: takes a line for the log where a refusal is another one than before. All are called
+        from any thread.
         """
-        self._target, self._freshness, self._is_unique = target, freshness, is_unique
-        parsers = {topics.TWIST: twist_command, topics.HEADING: heading_command}
-        actions: dict[str, Action] = {topics.ARM: self._arm, topics.STOP: self._stop}
-        for topic, (source, kind) in topics.setpoint_topics(sources).items():
-            actions[topic] = partial(self._drive, source, parsers[kind])
-        for topic, contact in CONTACTS.items():
-            actions[topic] = partial(self._touch, contact)
-        super().__init__(actions, report, "see controller.sources.names")
+        self._freshness, self._is_unique, self._why_not, self._report = freshness, is_unique, why_not, report
+        self.wheels, self.requests, self.samples = MessageCounts(), MessageCounts(), MessageCounts()
+        self._counts = dict.fromkeys(topics.NAVIGATION_TOPICS, self.requests)
+        self._counts |= dict.fromkeys(topics.SENSOR_TOPICS, self.samples)
+        self._actions: dict[str, Action] = {}
+        if controller is not None:
+            self._controller = controller
+            self._actions |= {topics.ARM: self._arm, topics.STOP: self._stop}
+            self._actions |= {topic: partial(self._touch, contact) for topic, contact in CONTACTS.items()}
+            for topic, (source, kind) in topics.setpoint_topics(sources).items():
+                parser = _twist_command if kind == topics.TWIST else _heading_command
+                self._actions[topic] = partial(self._drive, source, parser)
+        if navigate is not None:
+            self._actions |= dict.fromkeys(topics.NAVIGATION_TOPICS, partial(self._ask, navigate))
+        if save_map is not None:
+            self._actions[topics.MAP] = partial(self._save, save_map)
+        self._actions |= dict.fromkeys(sensors, partial(self._sample, take_sample, decode_sample))
         self._stop_ns = 0  # arrival of the newest stop
         self._touched_ns = dict.fromkeys(CONTACTS.values(), 0)  # when the newest contact was sent, or arrived before
         # Sender and newest arrival of the setpoints of each source: the first one begins a motion, the others go on
         # with it. There are none after a stop.
         self._streams: dict[str, tuple[str, int]] = {}
-        self.stops = self.arms = 0
+        self.stops = 0
+
+    def receive(self, request: Request) -> Answer | None:
+        """Handle one message; return the refusal, None where there is none or the target answers."""
+        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids a command
+        counts = self._counts.get(request.topic, self.wheels)
+        try:
+            if (action := self._actions.get(request.topic)) is None:
+                raise Refused("not available", self._why_not.get(request.topic, "see controller.sources.names"))
+            if len(request.payload) > (longest := topics.command_of(request.topic).longest):
+                raise Refused("too long", f"{len(request.payload)} bytes, expected at most {longest}")
+            action(request, arrival_ns)
+        except OmnidError as error:
+            if request.topic in CONTACTS and request.topic in self._actions:  # what cannot be read is a contact
+                self._controller.touch(CONTACTS[request.topic], holds=True)
+            counts.refused[error.reason if isinstance(error, Refused) else "malformed"] += 1
+            before, counts.refusal = counts.refusal, f"a message on {plain(request.topic)} is refused: {error}"
+            if counts.refusal != before:
+                self._report(counts.refusal)
+            return Answer(False, str(error))
+        return None
 
     def _stop(self, _: Request, arrival_ns: int) -> None:
         self._stop_ns = arrival_ns
         self._streams.clear()
         self.stops += 1
-        self._target.stop()
-
-    def _on_refusal(self, topic: str) -> None:
-        if topic in CONTACTS:
-            self._target.touch(CONTACTS[topic], holds=True)
+        self._controller.stop()
 
     def _touch(self, contact: str, request: Request, arrival_ns: int) -> None:
-        """Pass the state of a contact on; a message that is refused is a contact.
+        """Pass the state of a contact on.
 
         A contact ends only by a Bool of False that was sent just now, and not before that of the contact, because
         messages may overtake each other. All other messages are a contact.
@@ -263,7 +214,7 @@ class CommandReceiver(Receiver):
             self._touched_ns[contact] = max(self._touched_ns[contact], min(sent_ns, arrival_ns))
         else:
             holds = self._freshness.require(request, arrival_ns) < self._touched_ns[contact]
-        self._target.touch(contact, holds=holds)
+        self._controller.touch(contact, holds=holds)
 
     def _arm(self, request: Request, arrival_ns: int) -> None:
         stamp_ns = codec.header_stamp_ns(codec.decoded(request.payload, codec.HEADER_SCHEMA))
@@ -273,8 +224,7 @@ class CommandReceiver(Receiver):
         if sent_ns <= self._stop_ns:
             raise Refused(OLDER_THAN_STOP)
         self._streams.clear()
-        self.arms += 1
-        self._target.send(ArmRequest(arrival_ns, request.id))
+        self._controller.send(ArmRequest(arrival_ns, request.id))
 
     def _drive(
         self, source: str, parser: Callable[[bytes], tuple[int, Setpoint]], request: Request, arrival_ns: int
@@ -284,47 +234,71 @@ class CommandReceiver(Receiver):
         goes_on = sender == request.sender and arrival_ns - before_ns <= self._freshness.stale_ns
         sent_ns = self._freshness.require(request, arrival_ns, stamp_ns, goes_on=goes_on)
         self._streams[source] = request.sender, arrival_ns
-        self.accepted += 1
+        self.wheels.accepted += 1
         age_ns = max(0, arrival_ns - sent_ns)
-        self._target.send(TimedSetpoint(arrival_ns, setpoint, source, request.sender, age_ns))
+        self._controller.send(TimedSetpoint(arrival_ns, setpoint, source, request.sender, age_ns))
 
+    def _ask(self, navigate: Callable[[requests.NavigationCommand], None], message: Request, arrival_ns: int) -> None:
+        """Pass on a request to the navigation.
 
-# Requests to the navigation.
-
-
-class NavigationReceiver(Receiver):
-    """Passes valid requests on.
-
-    What ends a motion (cancel, pause, finish, stop) is obeyed whatever its age. All else needs a fresh stamp: a request
-    that waited in a network must not start a drive minutes later.
-    """
-
-    def __init__(
-        self,
-        target: Callable[[requests.NavigationCommand], None],
-        freshness: Freshness,
-        *,
-        report: Callable[[str], None] | None = None,
-    ) -> None:
-        """target: may be called from any thread. freshness: as of CommandReceiver."""
-        super().__init__(dict.fromkeys(topics.NAVIGATION_TOPICS, self._ask), report, "see omnid.transport.topics")
-        self._target, self._freshness = target, freshness
-
-    def stats(self) -> dict[str, object]:
-        """Return how many requests were accepted, and how many were not valid, by reason."""
-        return {"accepted": self.accepted, **by_reason(REFUSED_PREFIX, self.refused)}
-
-    def _ask(self, message: Request, arrival_ns: int) -> None:
-        request, stamp_ns = navigation_request(message.topic, message.payload)
+        What ends a motion (cancel, pause, finish, stop) is obeyed whatever its age. All else needs a fresh stamp: a
+        request that waited in a network must not start a drive minutes later.
+        """
+        request, stamp_ns = _navigation_request(message.topic, message.payload)
         is_finish = isinstance(request, requests.RouteRequest) and request.action is requests.RouteAction.FINISH
         if not (requests.stops_motion(request) or is_finish):
             self._freshness.require(message, arrival_ns, stamp_ns)
-        self.accepted += 1
+        self.requests.accepted += 1
         stamp_ns = stamp_ns or message.sent_ns
-        self._target(requests.NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=arrival_ns))
+        navigate(requests.NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=arrival_ns))
+
+    def _save(self, save_map: Callable[[int], object], request: Request, _: int) -> None:
+        if codec.string_from_cdr(request.payload) != topics.SAVE_MAP:
+            raise OmnidError(f'a String "{topics.SAVE_MAP}" was expected')
+        save_map(request.id)
+
+    def _sample(
+        self,
+        take: Callable[[MotionSample], None],
+        decode: Callable[[bytes, str], MotionSample | None],
+        request: Request,
+        _: int,
+    ) -> None:
+        sample = decode(request.payload, topics.command_of(request.topic).schema)
+        if sample is not None:
+            self.samples.accepted += 1
+            take(sample)
 
 
-def navigation_request(topic: str, payload: bytes) -> tuple[requests.NavigationRequest, int]:
+def _twist_command(payload: bytes) -> tuple[int, Setpoint]:
+    """Return the stamp [ns], 0 without one, of a speed and a yaw rate. Raise OmnidError for anything else."""
+    stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = codec.twist_from_cdr(payload)
+    _check(frame, "base_link", velocity_mps, yaw_rate_radps)
+    for name, speed in aside.items():
+        if not abs(speed) <= LEAST_SPEED:
+            found = f"twist.{name} = {speed:g}; send linear.x and angular.z only"
+            raise Refused("not possible with a differential drive", found)
+    return stamp_ns, Setpoint(velocity_mps, None, yaw_rate_radps)
+
+
+def _heading_command(payload: bytes) -> tuple[int, Setpoint]:
+    """Return the stamp [ns] of a speed and a heading in odom. Raise OmnidError for anything else."""
+    stamp_ns, frame, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
+    _check(frame, "odom", velocity_mps, heading_rad)
+    return stamp_ns, Setpoint(velocity_mps, heading_rad)
+
+
+def _check(frame: str, expected: str, *values: float) -> None:
+    """Raise Refused for another frame, or for a number (SI units) of which the sender must have meant another unit."""
+    if frame not in ("", expected):
+        raise Refused("wrong frame", f"{frame[:40]!a}, expected {expected} or none")
+    if not all(map(math.isfinite, values)):
+        raise Refused("not finite")
+    if any(abs(value) > LARGEST_VALUE for value in values):
+        raise Refused("out of range")
+
+
+def _navigation_request(topic: str, payload: bytes) -> tuple[requests.NavigationRequest, int]:
     """Decode a request and its stamp [ns], 0 where it has none. Raise OmnidError for anything else."""
     if topic in (topics.GOAL, topics.PATH):
         decode = codec.goal_from_cdr if topic == topics.GOAL else codec.path_from_cdr
@@ -341,33 +315,3 @@ def navigation_request(topic: str, payload: bytes) -> tuple[requests.NavigationR
     stamped = _STAMPED.fullmatch(text)
     text, stamp_ns = (stamped[1], int(stamped[2])) if stamped else (text, 0)
     return (requests.navigation_verb(text) if topic == topics.NAVIGATION else requests.route_request(text)), stamp_ns
-
-
-# Samples of wheels and gyro.
-
-
-class SensorReceiver(Receiver):
-    """Passes valid samples on."""
-
-    def __init__(
-        self,
-        target: Callable[[MotionSample], None],
-        stamp_ns: Callable[[int], int],
-        used: Collection[str],
-        report: Callable[[str], None],
-        joints: JointWheels | None = None,
-    ) -> None:
-        """target: may be called from any thread. stamp_ns: returns the stamp, as those of images, of a Unix time.
-
-        used: topics. joints: the wheels.
-        """
-        advice = "it is not used, see motion.wheels, motion.wheel_joints and motion.imu"
-        super().__init__(dict.fromkeys(used, self._take), report, advice)
-        self._joints, self._target, self._stamp_ns = joints, target, stamp_ns
-
-    def _take(self, request: Request, _: int) -> None:
-        schema = topics.command_of(request.topic).schema
-        sample = sample_from_cdr(request.payload, schema, self._stamp_ns, self._joints)
-        if sample is not None:
-            self.accepted += 1
-            self._target(sample)

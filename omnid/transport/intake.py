@@ -11,10 +11,10 @@ import json
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from itertools import count
-from typing import Any, Final, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Final
 
 import zenoh
 
@@ -22,33 +22,31 @@ from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.topics import ARM, MOST_OPEN, STOP, Answer, Request, command_of, request_key
 
-T = TypeVar("T")
-RequestCallback: TypeAlias = Callable[[Request], None]
 PERIOD_S: Final = 0.004  # Time between two passes.
 
 
-def burst_of(rate_hz: float) -> int:
-    """Return the messages at once, and in the ring: of a quarter of a second, so long a flood can hold one up."""
-    return max(4, round(rate_hz / 4))
+class Ring:
+    """The messages, or the queries, of one key that wait; at most so many a second are taken.
 
+    It holds those of a quarter of a second: so long a flood can hold one up. floods: how often there were more.
+    """
 
-class Intake(Generic[T]):
-    """Takes at most so many messages a second of one key out of its ring. floods: how often there were more."""
-
-    def __init__(self, key: str, next_message: Callable[[], T | None], rate_hz: float) -> None:
-        self.key, self._next, self._rate_hz = key, next_message, rate_hz
+    def __init__(self, declare: Callable[..., Any], key: str, rate_hz: float, topic: str = "") -> None:
+        self.key, self.topic, self._rate_hz = key, topic, rate_hz
+        self._capacity = max(4, round(rate_hz / 4))
+        self._declared = declare(key, zenoh.handlers.RingChannel(self._capacity))
         self._allowed, self._at_s = 0.0, -math.inf
         self.floods = 0
 
-    def messages(self) -> Iterator[T]:
-        """Yield the messages that may be decoded now; the others wait in the ring, until newer ones replace them."""
+    def messages(self) -> Iterator[Any]:
+        """Yield the messages that may be decoded now; the others wait, until newer ones replace them."""
         now_s = time.monotonic()
         # One more than the ring holds at once: what comes at once is no flood.
-        self._allowed = min(burst_of(self._rate_hz) + 1, self._allowed + (now_s - self._at_s) * self._rate_hz)
+        self._allowed = min(self._capacity + 1, self._allowed + (now_s - self._at_s) * self._rate_hz)
         self._at_s = now_s
         while self._allowed >= 1.0:
             # An empty ring is the usual case, hundreds of times a second: it costs one call.
-            if (message := self._next()) is None:
+            if (message := self._declared.try_recv()) is None:
                 return
             self._allowed -= 1.0
             yield message
@@ -89,13 +87,6 @@ class OpenRequests:
                 query.reply(query.key_expr, json.dumps(answer._asdict()), encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
-class _Ring(NamedTuple):
-    """The messages, or the queries, of one key that wait."""
-
-    topic: str
-    intake: Intake[Any]
-
-
 class CommandIntake:
     """Passes commands on within the budgets of their keys, by `process`, which one thread calls again and again."""
 
@@ -103,24 +94,24 @@ class CommandIntake:
         self,
         session: zenoh.Session,
         config: BusConfig,
-        topics: Mapping[str, str],
+        topics: Iterable[str],
         requests: OpenRequests,
-        callback: RequestCallback,
+        callback: Callable[[Request], None],
     ) -> None:
         """topics: those to receive besides stops and requests to arm. requests: keeps unanswered queries.
 
         callback: takes each message, in the thread of `process`.
         """
         self._callback, self._open = callback, requests
-        self._topics = sorted(set(topics) - {ARM, STOP})
-        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
-        self._rings = list(self._declare(session, config))
-        self._stops = [ring for ring in self._rings if ring.topic == STOP]
-
-    @property
-    def intakes(self) -> Sequence[Intake[Any]]:
-        """The takers of the messages of all rings, with the counts of refused messages."""
-        return [ring.intake for ring in self._rings]
+        self.rings: list[Ring] = []  # those of requests to arm and of stops are the last ones
+        for topic in (*sorted({*topics} - {ARM, STOP}), ARM, STOP):
+            command = command_of(topic)
+            places: list[tuple[Callable[..., Any], str]] = [(session.declare_subscriber, f"{config.robot}/{topic}")]
+            if config.ros2 == "rmw_zenoh":  # a key of it ends with the type of the message and the hash of that type
+                places += [(session.declare_subscriber, f"{config.ros2_domain}/{config.robot}/{topic}/*/*")]
+            if command.is_request:
+                places += [(session.declare_queryable, f"{config.robot}/{request_key(topic)}")]
+            self.rings += [Ring(declare, key, command.rate_hz, topic) for declare, key in places]
 
     def process(self) -> None:
         """Pass on what has come. Of a stop and a request to arm in one pass the stop wins.
@@ -130,13 +121,11 @@ class CommandIntake:
         # 1. Stops.
         stopped, asked_to_arm = self._stop(), False
         # 2. All other messages; requests to arm are the last of them.
-        for ring in self._rings:
-            if ring.topic == STOP:
-                continue
-            for message in ring.intake.messages():
+        for ring in self.rings:
+            for message in ring.messages() if ring.topic != STOP else ():
                 asked_to_arm |= ring.topic == ARM
                 # A request names one robot and one topic: a query for several keys is none.
-                if isinstance(message, zenoh.Sample) or str(message.key_expr) == ring.intake.key:
+                if isinstance(message, zenoh.Sample) or str(message.key_expr) == ring.key:
                     self._pass_on(ring.topic, message)
         # 3. After a request to arm: a stop that came in the meantime, or else that of step 1 once more.
         if asked_to_arm and not self._stop() and stopped:
@@ -144,7 +133,7 @@ class CommandIntake:
 
     def _stop(self) -> bool:
         """Pass on the stops that have come; return whether there was one."""
-        samples = [sample for ring in self._stops for sample in ring.intake.messages()]
+        samples = [sample for ring in self.rings if ring.topic == STOP for sample in ring.messages()]
         if samples:
             self._pass_on(STOP, samples[-1])
         return bool(samples)
@@ -162,19 +151,3 @@ class CommandIntake:
         if isinstance(message, zenoh.Sample) and message.source_info is not None:
             sender = str(message.source_info.source_id.zid)
         self._callback(Request(topic, payload, sender, sent_ns, self._open.add(topic, query), echo_ns))
-
-    def _declare(self, session: zenoh.Session, config: BusConfig) -> Iterator[_Ring]:
-        """Declare subscribers and queryables; yield their rings, those of requests to arm and of stops last."""
-        for topic in (*self._topics, ARM, STOP):
-            yield self._ring(session.declare_subscriber, topic, f"{config.robot}/{topic}")
-            if config.ros2 == "rmw_zenoh":  # a key of it ends with the type of the message and the hash of that type
-                key = f"{config.ros2_domain}/{config.robot}/{topic}/*/*"
-                yield self._ring(session.declare_subscriber, topic, key)
-            if command_of(topic).is_request:
-                yield self._ring(session.declare_queryable, topic, f"{config.robot}/{request_key(topic)}")
-
-    def _ring(self, declare: Callable[..., Any], topic: str, key: str) -> _Ring:
-        rate_hz = command_of(topic).rate_hz
-        declared = declare(key, zenoh.handlers.RingChannel(burst_of(rate_hz)))
-        self._declared.append(declared)
-        return _Ring(topic, Intake(key, declared.try_recv, rate_hz))

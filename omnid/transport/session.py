@@ -18,15 +18,13 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
-from omnid.transport.bus_config import BusConfig, checked, text_of_file
+from omnid.transport.bus_config import KEY, BusConfig
 
 HERE: Final = "tcp/127.0.0.1:7447"
 ALIVE: Final = "alive"  # key of the liveliness token below the robot's name
+_ROS_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PROTOCOLS: Final = "transport/link/protocols"
-_PROTOCOL: Final = re.compile(r'"([a-z0-9_-]+)/')
-_USERS: Final = "transport/auth/usrpwd/dictionary_file"
-_CERTIFICATES: Final = "transport/link/tls/enable_mtls"
 QUERY_S: Final = 1.0  # A query without an answer ends after this time, and a client tries again to connect.
 # zenoh's threads (zenoh-runtime): what one robot receives needs one, and accepting links none of its own.
 _THREADS: Final = "(rx: (worker_threads: 1), acc: (handover: app))"
@@ -55,15 +53,14 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
     try:
         return zenoh.open(prepared)
     except zenoh.ZError as error:
-        cause = reason(error)
         if config.is_client:
             raise Unreachable(
                 f"bus cannot reach {', '.join(config.connect)}: start the robot or router there, or change bus.connect "
-                f"({cause})"
+                f"({reason(error)})"
             ) from error
         raise OmnidError(
             f"bus cannot listen on {', '.join(config.listen)}: stop the other program there or change bus.listen; of a "
-            f"router such as rmw_zenohd be a client: bus.listen = [], bus.connect = its endpoint ({cause})"
+            f"router such as rmw_zenohd be a client: bus.listen = [], bus.connect = its endpoint ({reason(error)})"
         ) from error
 
 
@@ -73,7 +70,7 @@ def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
     Raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings.
     """
     # Peers that only share a router exchange no messages, clients do.
-    config = checked(BusConfig(robot=given.robot, listen=(), connect=given.connect or (HERE,), config=given.config))
+    config = BusConfig(robot=given.robot, listen=(), connect=given.connect or (HERE,), config=given.config)
     deadline_s = time.monotonic() + timeout_s
     while True:
         try:
@@ -100,8 +97,14 @@ def has_receiver(declared: zenoh.Publisher | zenoh.Querier) -> bool:
 def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
     """Return zenoh's configuration: the endpoints of [bus], all else by its own file, else by omnid's defaults.
 
-    zenoh's defaults are replaced because they listen on all interfaces and use multicast.
+    zenoh's defaults are replaced because they listen on all interfaces and use multicast. Raise OmnidError for an
+    invalid name or endpoint, or a file that cannot be used.
     """
+    if not (KEY if config.ros2 == "off" else _ROS_NAME).fullmatch(config.robot):
+        raise OmnidError(
+            f"bus.robot is {config.robot!r}; use letters, digits, '_', '.', '-' and inner '/'; with ROS 2 neither '.' "
+            "nor '-', and a letter first"
+        )
     result, untouched = _of_file(config), zenoh.Config()
     # 1. Who connects where is said in [bus].
     endpoints: dict[str, Any] = {
@@ -112,8 +115,11 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
     }
     if config.is_client:
         endpoints["connect/timeout_ms"] = 1000  # a client that cannot reach its router opens no session
-    for key, value in endpoints.items():
-        result.insert_json5(key, json.dumps(value))
+    try:
+        for key, value in endpoints.items():
+            result.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        raise OmnidError(f"bus.listen, bus.connect: {reason(error)}; an example is {HERE}") from error
     # 2. omnid's defaults, where the file says nothing.
     text = (files("omnid.transport") / "default.json5").read_text("utf-8")
     names = {"ROBOT": config.robot, "DOMAIN": str(config.ros2_domain)}
@@ -123,15 +129,16 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
             result.insert_json5(key, defaults.get_json(key))
     # 3. No links of other protocols than those of the endpoints.
     if json.loads(result.get_json(_PROTOCOLS)) is None:
-        used = _PROTOCOL.findall(json.dumps([*config.listen, *config.connect]))
-        result.insert_json5(_PROTOCOLS, json.dumps(sorted(set(used))))
+        used = {endpoint.partition("/")[0] for endpoint in (*config.listen, *config.connect)}
+        result.insert_json5(_PROTOCOLS, json.dumps(sorted(used)))
     return result
 
 
 def needs_proof(config: BusConfig) -> bool:
     """True if who connects must show a password or a certificate, by zenoh's own file."""
+    users, certificates = "transport/auth/usrpwd/dictionary_file", "transport/link/tls/enable_mtls"
     found = _of_file(config)
-    return json.loads(found.get_json(_USERS)) is not None or bool(json.loads(found.get_json(_CERTIFICATES)))
+    return json.loads(found.get_json(users)) is not None or bool(json.loads(found.get_json(certificates)))
 
 
 def reason(error: zenoh.ZError) -> str:
@@ -140,10 +147,7 @@ def reason(error: zenoh.ZError) -> str:
 
 
 def _of_file(config: BusConfig) -> zenoh.Config:
-    if not config.config:
-        return zenoh.Config()
     try:
-        return zenoh.Config.from_json5(text_of_file(config.config))
+        return zenoh.Config.from_file(config.config) if config.config else zenoh.Config()
     except zenoh.ZError as error:
-        message = f"bus.config: {config.config!r} is not a zenoh configuration: {reason(error)}; correct the file"
-        raise OmnidError(message) from error
+        raise OmnidError(f"bus.config: {config.config!r} cannot be used: {reason(error)}") from error

@@ -13,9 +13,9 @@ import secrets
 import select
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import needs_proof
@@ -23,7 +23,7 @@ from omnid.transport.session import needs_proof
 ASKED: Final = "asked"  # the daemon has passed the stop on
 STOPPED: Final = "stopped"  # the robot is disarmed by a stop
 REPEAT_S: Final = 0.05
-MOST_PER_PASS: Final = 16  # Most datagrams that one pass reads during a flood.
+MOST_PER_PASS: Final = 16  # Most datagrams that one pass reads of a socket during a flood.
 _HEAD: Final = b"omnid stop 1 "
 _LONGEST: Final = 512  # bytes
 _REQUEST: Final = re.compile(rb"omnid stop 1 ([0-9a-f]{16}) ([!-~]{1,256}) *")
@@ -44,59 +44,41 @@ class StopListener:
     def __init__(self, config: BusConfig, on_stop: Callable[[], None], is_stopped: Callable[[], bool]) -> None:
         """on_stop: called for each request. is_stopped: True if the robot is disarmed by a stop."""
         self._robot, self._on_stop, self._is_stopped = config.robot.encode(), on_stop, is_stopped
-        self._sockets: list[socket.socket] = []
+        own, proves = ("localhost", "127.0.0.1", "::1"), needs_proof(config)
+        found = [(host if host in own or not proves else own[1], port) for host, port in addresses(config.listen)]
+        self._sockets = _sockets(found, listens=True)
         self._poll = select.poll()
-        proves = needs_proof(config)
-        for host, port in addresses(config.listen):
-            if proves and host not in ("localhost", "127.0.0.1", "::1"):
-                host = "127.0.0.1"
-            with suppress(OSError):
-                self._sockets.append(_bound(host, port))
-                self._poll.register(self._sockets[-1], select.POLLIN)
+        for listener in self._sockets:
+            self._poll.register(listener, select.POLLIN)
 
     def process(self) -> None:
         """Take the requests that have come, a bounded number, or wait for one."""
         self._poll.poll(1000 * REPEAT_S)
         for listener in self._sockets:
             for _ in range(MOST_PER_PASS):
-                try:
+                with suppress(OSError):  # there is no more, or an earlier answer could not be delivered
                     data, sender = listener.recvfrom(_LONGEST)
-                except BlockingIOError:
-                    break
-                except OSError:  # of an earlier answer that could not be delivered
-                    continue
-                self._answer(listener, data, sender)
+                    found = _REQUEST.fullmatch(data)
+                    if found is not None and found[2] == self._robot:
+                        self._on_stop()
+                        state = STOPPED if self._is_stopped() else ASKED
+                        listener.sendto(_HEAD + found[1] + b" " + state.encode(), sender)
 
     def close(self) -> None:
         """Close the ports."""
         for listener in self._sockets:
             listener.close()
 
-    def _answer(self, listener: socket.socket, data: bytes, sender: tuple[Any, ...]) -> None:
-        found = _REQUEST.fullmatch(data)
-        if found is None or found[2] != self._robot:
-            return
-        self._on_stop()
-        state = STOPPED if self._is_stopped() else ASKED
-        with suppress(OSError):
-            listener.sendto(_HEAD + found[1] + b" " + state.encode(), sender)
-
 
 class StopSender:
     """The client of a stop: it asks all endpoints at the same time."""
 
     def __init__(self, robot: str, endpoints: Sequence[str]) -> None:
-        self._nonce = secrets.token_hex(8).encode()
+        nonce = secrets.token_hex(8).encode()
         # No answer is longer than its request.
-        self._request = _HEAD + self._nonce + b" " + robot.encode() + b" " * len(STOPPED)
-        self._sockets: list[socket.socket] = []
-        for host, port in addresses(endpoints):
-            with suppress(OSError):
-                family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-                sender = socket.socket(family, socket.SOCK_DGRAM)
-                self._sockets.append(sender)
-                sender.connect(address)
-                sender.setblocking(False)
+        self._request = _HEAD + nonce + b" " + robot.encode() + b" " * len(STOPPED)
+        self._answers = {_HEAD + nonce + b" " + state.encode(): state for state in (ASKED, STOPPED)}
+        self._sockets = _sockets(addresses(endpoints), listens=False)
 
     def ask(self, wait_s: float) -> str:
         """Ask for a stop again and again until it is confirmed; return the best answer within the time, "" without."""
@@ -106,7 +88,10 @@ class StopSender:
                 with suppress(OSError):  # no program listens there
                     sender.send(self._request)
             time.sleep(min(REPEAT_S, max(0.0, deadline_s - time.monotonic())))
-            answer = max((self._answer(sender) for sender in self._sockets), key=len, default="") or answer
+            for sender in self._sockets:
+                with suppress(OSError):  # there is no more, or no program listens there
+                    for _ in range(MOST_PER_PASS):
+                        answer = self._answers.get(sender.recv(_LONGEST), answer)
             if time.monotonic() >= deadline_s:
                 break
         return answer
@@ -116,27 +101,14 @@ class StopSender:
         for sender in self._sockets:
             sender.close()
 
-    def _answer(self, sender: socket.socket) -> str:
-        """Return the newest answer that has come, "" where there is none."""
-        answer = ""
-        for _ in range(MOST_PER_PASS):
-            try:
-                data = sender.recv(_LONGEST)
-            except OSError:  # there is no more, or no program listens there
-                break
-            for state in (ASKED, STOPPED):
-                if data == _HEAD + self._nonce + b" " + state.encode():
-                    answer = state
-        return answer
 
-
-def _bound(host: str, port: int) -> socket.socket:
-    family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-    listener = socket.socket(family, socket.SOCK_DGRAM)
-    try:
-        listener.setblocking(False)
-        listener.bind(address)
-    except OSError:
-        listener.close()
-        raise
-    return listener
+def _sockets(found: Iterable[tuple[str, int]], *, listens: bool) -> list[socket.socket]:
+    """Return sockets for datagrams at hosts and ports, or to them; those that cannot be had are of no effect."""
+    opened = []
+    for host, port in found:
+        with suppress(OSError):
+            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            opened.append(socket.socket(family, socket.SOCK_DGRAM))
+            opened[-1].setblocking(False)
+            (opened[-1].bind if listens else opened[-1].connect)(address)
+    return opened

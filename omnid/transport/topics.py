@@ -76,7 +76,6 @@ NAVIGATION_TOPICS: Final = (GOAL, PATH, NAVIGATION, ROUTE)
 SENSOR_TOPICS: Final = (WHEEL_ODOM, IMU, JOINT_STATES)
 TWIST: Final = "twist"
 HEADING: Final = "heading"
-_SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
 
 
 class Command(NamedTuple):
@@ -89,17 +88,24 @@ class Command(NamedTuple):
 
 
 _request = partial(Command, rate_hz=50.0, is_request=True)
+# Samples are below `cmd`, too, because they move the pose while the cameras show nothing: only programs that may
+# command the robot may write them.
 COMMANDS: Final = {
-    STOP: Command(EMPTY_SCHEMA, longest=sys.maxsize),
-    ARM: _request(codec.HEADER_SCHEMA),
-    **dict.fromkeys((BUMPER, CLIFF), Command(codec.BOOL_SCHEMA)),
-    GOAL: _request(codec.POSE_SCHEMA),
+    STOP: Command(EMPTY_SCHEMA, longest=sys.maxsize),  # anything
+    ARM: _request(codec.HEADER_SCHEMA),  # with the time it was sent
+    **dict.fromkeys((BUMPER, CLIFF), Command(codec.BOOL_SCHEMA)),  # all but a fresh False is a contact
+    GOAL: _request(codec.POSE_SCHEMA),  # in map or odom; a quaternion of zeros asks for no heading
     PATH: _request(codec.PATH_SCHEMA, rate_hz=2.0, longest=1 << 20),
+    # "cancel", "pause", "resume"; "teach NAME [replace]", "finish", "repeat NAME [reverse] [loops=N]", "stop"; "save".
+    # Its time of sending is attached, or the last word, stamp=NANOSECONDS.
     **dict.fromkeys((NAVIGATION, ROUTE, MAP), _request(codec.STRING_SCHEMA)),
     WHEEL_ODOM: Command(codec.ODOMETRY_SCHEMA),
     IMU: Command(codec.IMU_SCHEMA),
     JOINT_STATES: Command(codec.JOINT_SCHEMA),
 }
+# Of each source, as cmd/planner/twist. TwistStamped in base_link: linear.x m/s, angular.z rad/s; or a plain Twist,
+# whose time of sending is attached. Vector3Stamped in odom: x the speed in m/s, z the heading in rad.
+_SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
 
 
 def command_of(topic: str) -> Command:

@@ -27,7 +27,7 @@ from starlette.staticfiles import StaticFiles
 
 from omnid.engine.logging_setup import is_journal, log
 from omnid.errors import OmnidError
-from omnid.transport.bus_config import BusConfig, checked
+from omnid.transport.bus_config import BusConfig
 from omnid.web.access import REFUSALS, Access, Guard, is_of_other_site, token_of
 from omnid.web.feed import RobotFeed
 from omnid.web.metrics import metrics
@@ -56,8 +56,7 @@ class WebSettings:
 
 def serve(bus: BusConfig, settings: WebSettings) -> None:
     """Serve the page until SIGINT or SIGTERM. Raise OmnidError for settings that cannot be used."""
-    # 1. Check the settings, and read the tokens.
-    checked(bus)
+    # 1. Read the tokens.
     token = token_of(settings.token_file)
     stop_token = token_of(settings.stop_token_file, "--stop-token-file") if settings.stop_token_file else ""
     if token == stop_token:

@@ -167,6 +167,6 @@ def test_the_daemon_on_a_log_reads_its_wheels_and_gyro_and_no_others(log: Path, 
         # The gyro of the log measures twice as often as its wheels; the motor's reports would come besides.
         assert float(values["wheel_samples"]) == pytest.approx(float(values["gyro_samples"]) / 2, rel=0.1)
         operator.send("cmd/imu", gyro_cdr(GyroSample(1, 0.0, 0.0, 0.0), 10**18))
-        wait_until(lambda: operator.values("wheels and gyro").get(f"{REFUSED_PREFIX}unknown topic") == "1", "a refusal")
+        wait_until(lambda: operator.values("wheels and gyro").get(f"{REFUSED_PREFIX}not available") == "1", "a refusal")
         code, err = daemon.end()
     assert code == 0 and "Traceback" not in err

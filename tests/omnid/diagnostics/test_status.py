@@ -66,7 +66,7 @@ class Daemon:
         self.motor = AcceptingMotor()
         self.controller = Controller(self.motor, ControllerSettings().without_obstacles, 0.05)
         self.controller_statistics = ControllerStatistics(self.stages[1])
-        self.commands = CommandReceiver(self, Freshness(0.5))
+        self.commands = CommandReceiver(Freshness(0.5), controller=self)
         self.report = StatusCollector(
             self.telemetry,
             self.cameras,

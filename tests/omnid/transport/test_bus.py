@@ -24,7 +24,6 @@ from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
-from omnid.transport.intake import burst_of
 from omnid.transport.session import open_client, open_session, zenoh_config
 from omnid.transport.status_names import BUS, entry
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
@@ -39,20 +38,17 @@ from tests.waiting import wait_until
     ("settings", "words"),
     [
         *(({"robot": name}, r"bus\.robot") for name in ("", "/a", "a//b", "a/**", "a b")),
-        ({"robot": "robot-1", "ros2": "rmw_zenoh"}, "ROS 2 takes"),
-        *(
-            ({name: (endpoint,)}, rf"bus\.{name}.*write protocol/host:port")
-            for endpoint in ("127.0.0.1:7447", "foo/127.0.0.1:1")
-            for name in ("listen", "connect")
-        ),
+        ({"robot": "robot-1", "ros2": "rmw_zenoh"}, r"bus\.robot.*with ROS 2"),
+        *(({name: ("127.0.0.1:7447",)}, rf"bus\.{name}.*an example is tcp/") for name in ("listen", "connect")),
+        ({"listen": ("foo/127.0.0.1:1",)}, r"bus\.listen.*foo"),
         ({"config": "/nowhere.json5"}, r"bus\.config.*nowhere.*No such file"),
-        ({"config": sys.executable}, r"bus\.config.*not text"),
+        ({"config": sys.executable}, r"bus\.config"),
     ],
 )
 def test_wrong_settings_are_refused_in_one_line(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(OmnidError, match=words) as caught:
         Bus(BusConfig(**({"listen": ()} | settings)))
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(caught.value) and ".rs:" not in str(caught.value)
 
 
 def setting(config: BusConfig, key: str) -> Any:
@@ -177,41 +173,9 @@ def test_a_taken_or_silent_endpoint_is_refused_with_the_setting_to_change() -> N
     assert endpoint in text and "bus.listen" in text and "Address already in use" in text and "\n" not in text
     with pytest.raises(Unreachable, match=r"change bus.connect"):
         Robot(connect=(endpoint,))
-    with pytest.raises(OmnidError, match="write protocol/host:port") as wrong:
+    with pytest.raises(OmnidError, match="an example is") as wrong:
         open_client(BusConfig(connect=("nowhere",)), timeout_s=60.0)
     assert not isinstance(wrong.value, Unreachable)
-
-
-def appears(endpoint: str) -> bool:
-    """True if a robot can be reached by the router."""
-    try:
-        Robot(connect=(endpoint,)).close()
-    except Unreachable:
-        return False
-    return True
-
-
-def test_a_client_waits_for_its_router() -> None:
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(), connect=(endpoint,)))) as bus:
-        received: list[str] = []
-        bus.subscribe_commands(lambda request: received.append(request.topic), {})
-        bus.serve("config", "robot = 1")
-        bus.connect()
-        bus.publish("odom", odometry(1))
-        assert entry(BUS, bus.stats()).level == WARN
-        assert entry(BUS, bus.stats()).message == f"no router yet at {endpoint}"
-        with script(ROUTER, endpoint):
-            wait_until(lambda: bus.connect() is None and entry(BUS, bus.stats()).level == OK)
-            bus.publish("odom", odometry(2))
-            wait_until(lambda: appears(endpoint))
-            with Robot(connect=(endpoint,)) as robot:
-                wait_until(lambda: robot.query("config") == "robot = 1")  # the router hears of it a moment later
-                driver = robot.driver()
-                wait_until(lambda: driver.stop() is None and "cmd/stop" in received)
-                pose = robot.subscribe(Pose).newest()
-                assert pose is not None and pose.stamp_ns == 10**9 + 2
-            assert (entry(BUS, bus.stats()).level, entry(BUS, bus.stats()).message) == (OK, "open")
 
 
 # Robots of one name.
@@ -223,9 +187,7 @@ def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
     with script(ROUTER, router), contextlib.ExitStack() as stack:
 
         def started(robot: str = "omnid") -> Bus:
-            bus = stack.enter_context(contextlib.closing(Bus(BusConfig(robot, (), (router,)), warnings.append)))
-            wait_until(lambda: bus.connect() is None and not entry(BUS, bus.stats()).message.startswith("no router"))
-            return bus
+            return stack.enter_context(contextlib.closing(Bus(BusConfig(robot, (), (router,)), warnings.append)))
 
         warnings, commands = list[str](), list[str]()
         first = started()
@@ -386,8 +348,7 @@ def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> N
             wait_until(lambda: driver.twist(0.1, 0.0) is None and commands["cmd/twist"] > 0)
             time.sleep(1.0)
             rate_hz = command_of(topic).rate_hz
-            most = 2 * burst_of(rate_hz) + rate_hz * (time.monotonic() - begin_s)
-            assert commands[topic] - before <= most
+            assert commands[topic] - before <= 2 * max(4, rate_hz / 4) + rate_hz * (time.monotonic() - begin_s)
 
 
 @pytest.mark.parametrize("answer", [Answer(True, "driving"), Answer(False, "not armed: d\u00e9sarm\u00e9\n" * 50)])
