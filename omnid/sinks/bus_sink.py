@@ -12,7 +12,7 @@ from drivers.motor import VelocityCommand
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import OdometryUpdate
-from omnid.sinks.encoder import Changes, Encoder, Outgoing, UnixTime, pose_attachment, same_time
+from omnid.sinks.encoder import Encoder, Outgoing, UnixTime, pose_attachment, same_time
 from omnid.transport.bus import Bus
 from omnid.transport.codec import CLOCK_SCHEMA, encoded, path_cdr
 from omnid.transport.sensor_codec import image_cdr
@@ -31,10 +31,10 @@ class BusSink:
         self._clock, self._time_ns = clock, 0
         self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
         self._path_is_new = False
-        self._bus, self._encode, self._changes = bus, encode, Changes(encode, RUN_ID)
+        self._bus, self._encode, encode.run_id = bus, encode, RUN_ID
 
     def process(self, message: Outgoing) -> None:
-        """Publish a message; a pose with its attachment, and what has changed: states and static frames."""
+        """Publish a message; a pose with its attachment."""
         # 1. The clock, before what is stamped by it.
         if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
             self._time_ns = message.stamp_ns
@@ -43,9 +43,6 @@ class BusSink:
         attachment = pose_attachment(message, time.time_ns(), RUN_ID) if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
-        # 3. What changes seldom, where it has changed.
-        for topic, _, payload in self._changes(message):
-            self._bus.publish(topic, payload)
         if isinstance(message, OdometryUpdate):
             self._publish_path(message)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Self, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,14 +58,18 @@ class OutgoingMessage(NamedTuple):
     schema: str
     payload: bytes
 
-    @classmethod
-    def on(cls, topic: str, payload: bytes) -> Self:
-        """Return a message on one of the topics that are published."""
-        return cls(topic, PUBLISHED[topic].schema, payload)
+
+def _on(topic: str, payload: bytes) -> OutgoingMessage:
+    """Return a message on one of the topics that are published."""
+    return OutgoingMessage(topic, PUBLISHED[topic].schema, payload)
 
 
 class Encoder:
-    """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's."""
+    """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's.
+
+    What changes seldom comes before the message that changes it: the static frames before the first pose, and a status
+    when the state of odom, or in the map, is another one. Its stamp is that of the pose.
+    """
 
     def __init__(
         self,
@@ -80,8 +84,15 @@ class Encoder:
         unix_ns: returns the Unix time of a stamp of the messages; those of a log are Unix time. rig: with the mounting
         of the cameras, for the static frames; None: they are left out.
         """
-        self.T_base_rig, self.unix_ns, self.rig = T_base_rig, unix_ns, rig
+        self.T_base_rig, self.unix_ns, self._rig = T_base_rig, unix_ns, rig
         self._cloud_points, self._scan_range_m = cloud_points, scan_range_m
+        self.run_id = ""  # of the run, where others record it; a log of one's own holds one run
+        self.repeat_states()
+
+    def repeat_states(self) -> None:
+        """Encode states and static frames again with the next messages, as for a new file."""
+        self._state: tuple[TrackingState, int] | None = None
+        self._state_in_map: MapState | None = None
 
     def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
         """Yield the encoded messages of a message."""
@@ -91,113 +102,79 @@ class Encoder:
                 yield from self._poses(message, stamp_ns)
             case VelocityCommand(_, velocity_mps, _, yaw_rate_radps):
                 payload = codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
-                yield OutgoingMessage.on("drive", payload)
+                yield _on("drive", payload)
             case PlaceUpdate():
                 yield from self._map_pose(message, stamp_ns)
             case ObstacleScan():
                 limits_m = 0.0, self._scan_range_m
-                scan = codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m)
-                yield OutgoingMessage.on(SCAN, scan)
-                yield OutgoingMessage.on("moving", codec.moving_cdr(stamp_ns, "odom", message.moving))
+                yield _on(SCAN, codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m))
+                yield _on("moving", codec.moving_cdr(stamp_ns, "odom", message.moving))
             case MapUpdate():
                 points = _most_confident(message.points, self._cloud_points)
-                cloud = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
-                yield OutgoingMessage.on("cloud", cloud)
+                yield _on("cloud", codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig))
             case GridUpdate():
                 grid = message.grid
-                payload = codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
-                yield OutgoingMessage.on("map", payload)
+                yield _on("map", codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner))
             case StatusReport():
-                yield OutgoingMessage.on("status", codec.diagnostics_cdr(stamp_ns, message.statuses))
+                yield _on("status", codec.diagnostics_cdr(stamp_ns, message.statuses))
             case NavigationUpdate():
                 status = entry(NAVIGATION, navigation_stats(message))
-                yield OutgoingMessage.on("navigation", codec.diagnostics_cdr(stamp_ns, [status]))
+                yield _on("navigation", codec.diagnostics_cdr(stamp_ns, [status]))
                 if message.plan is not None:
                     plan = message.plan
-                    yield OutgoingMessage.on("plan", codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad))
+                    yield _on("plan", codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad))
 
     def _poses(self, odometry: OdometryUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
+        # 1. The frames that do not move on the robot: base_link -> rig -> lower and upper camera; the state.
+        if self._state is None:
+            edges = [("base_link", "rig", self.T_base_rig)]
+            if self._rig is not None:
+                cameras = {"lower": self._rig.lower, "upper": self._rig.upper}
+                edges += [("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
+            yield _on("/tf_static", codec.transform_cdr(stamp_ns, edges))
+        if (odometry.state, odometry.reset_counter) != self._state:
+            self._state = odometry.state, odometry.reset_counter
+            values = {
+                Key.STATE: odometry.state,
+                Key.RUN: self.run_id,
+                Key.RESETS: odometry.reset_counter,
+                Key.INLIERS: odometry.inliers,
+                Key.TRACKED: odometry.tracks,
+            }
+            level = list(TrackingState).index(odometry.state)
+            status = DiagnosticStatus.of(ODOMETRY, level, odometry.state, values)
+            yield _on("status", codec.diagnostics_cdr(stamp_ns, [status]))
+        # 2. The pose and its transform.
         T_odom_base, covariance, velocity, velocity_covariance = of_base(odometry, self.T_base_rig)
-        pose = codec.odometry_cdr(
-            stamp_ns, T_odom_base, in_outer_axes(T_odom_base, covariance), velocity, velocity_covariance
-        )
-        yield OutgoingMessage.on("odom", pose)
-        yield OutgoingMessage.on("pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base))
-        yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [("odom", "base_link", T_odom_base)]))
-        # Samples of wheels and gyro up to the pair; those after it come with the next one again.
+        covariance = in_outer_axes(T_odom_base, covariance)
+        yield _on("odom", codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity, velocity_covariance))
+        yield _on("pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base))
+        yield _on("/tf", codec.transform_cdr(stamp_ns, [("odom", "base_link", T_odom_base)]))
+        # 3. Samples of wheels and gyro up to the pair; those after it come with the next one again.
         for sample in odometry.motion:
             if sample.stamp_ns > odometry.stamp_ns:
                 continue
             if isinstance(sample, WheelSample):
-                yield OutgoingMessage.on("wheel_odom", wheel_cdr(sample, self.unix_ns(sample.stamp_ns)))
+                yield _on("wheel_odom", wheel_cdr(sample, self.unix_ns(sample.stamp_ns)))
             else:
-                yield OutgoingMessage.on("imu", gyro_cdr(sample, self.unix_ns(sample.stamp_ns)))
+                yield _on("imu", gyro_cdr(sample, self.unix_ns(sample.stamp_ns)))
 
     def _map_pose(self, update: PlaceUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
+        if update.state != self._state_in_map:
+            self._state_in_map = update.state
+            status = entry(PLACES, {Key.STATE: update.state})
+            yield _on("status", codec.diagnostics_cdr(stamp_ns, [status]))
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
-        yield OutgoingMessage.on(
-            MAP_POSE, codec.map_pose_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
-        )
+        yield _on(MAP_POSE, codec.map_pose_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance)))
         if update.is_known:  # a transform has no covariance that could say that it is not
             T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
-            yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)]))
-
-
-def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
-    """Return the frames that do not move on the robot, as /tf_static: base_link -> rig -> lower and upper camera.
-
-    stamp_ns: of a pose.
-    """
-    edges = [("base_link", "rig", encode.T_base_rig)]
-    if encode.rig is not None:
-        cameras = {"lower": encode.rig.lower, "upper": encode.rig.upper}
-        edges += [("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
-    return OutgoingMessage.on("/tf_static", codec.transform_cdr(encode.unix_ns(stamp_ns), edges))
+            yield _on("/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)]))
 
 
 def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0, run: str = "") -> bytes:
     """Return what is attached to a pose; sent_ns: Unix time at which it is handed to the network; run: identity."""
     counts = odometry.reset_counter, odometry.inliers, odometry.tracks
     return PoseAttachment(odometry.seq, odometry.state, *counts, sent_ns, run).to_bytes()
-
-
-class Changes:
-    """Yields what changes seldom: the static frames once, and a status when the state of odom, or in the map, changes.
-
-    A status of the odometry has the stamp of its pose.
-    """
-
-    def __init__(self, encode: Encoder, run_id: str = "") -> None:
-        """run_id: of the run, where others record it; a log of one's own holds one run."""
-        self._encode, self._run_id = encode, run_id
-        self._last: tuple[str, int] | None = None
-        self._last_in_map: MapState | None = None
-
-    def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
-        """Yield what differs from the last message of this kind."""
-        if isinstance(message, PlaceUpdate):
-            if message.state == self._last_in_map:
-                return
-            self._last_in_map = message.state
-            status = entry(PLACES, {Key.STATE: message.state})
-        elif isinstance(message, OdometryUpdate):
-            if self._last is None:
-                yield static_frames(self._encode, message.stamp_ns)
-            if (message.state, message.reset_counter) == self._last:
-                return
-            self._last = message.state, message.reset_counter
-            values = {
-                Key.STATE: message.state,
-                Key.RUN: self._run_id,
-                Key.RESETS: message.reset_counter,
-                Key.INLIERS: message.inliers,
-                Key.TRACKED: message.tracks,
-            }
-            level = list(TrackingState).index(message.state)
-            status = DiagnosticStatus.of(ODOMETRY, level, message.state, values)
-        else:
-            return
-        yield from self._encode(StatusReport(message.stamp_ns, [status]))
 
 
 def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -13,8 +14,7 @@ from drivers.logs.rotating_log import RotatingLog, RotatingLogState
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.errors import OmnidError
-from omnid.messages import OdometryUpdate
-from omnid.sinks.encoder import Changes, Encoder, Outgoing, OutgoingMessage
+from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.topics import ros_name
 
@@ -30,15 +30,14 @@ class SingleLog:
     def __init__(self, path: Path, attachments: Mapping[str, bytes]) -> None:
         """attachments: name -> content, written at the start of the file."""
         self.state = RotatingLogState()
-        self._path, self._attachments = path, dict(attachments)
+        self._open = partial(LogWriter, path, dict(attachments))
         self._writer: LogWriter | None = None
 
     def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
         """Add a message, CDR with its encapsulation header."""
-        if self._writer is None:
-            self._writer = LogWriter(self._path, self._attachments)
-            self.state.files, self.state.file, self.state.status = 1, str(self._path), "recording"
+        self._writer = self._writer or self._open()
         self._writer.write(topic, schema_name, data, stamp_ns)
+        self.state.files = 1
         self.state.messages += 1
 
     def end_file(self) -> None:
@@ -48,7 +47,6 @@ class SingleLog:
         """Complete the file; a second call does nothing."""
         if self._writer is not None:
             self._writer.close()
-        self.state.status = "closed"
 
 
 class ThinnedPairs:
@@ -105,7 +103,6 @@ class Recorder:
         self._log, self._robot, self._encode = log, robot, encode
         self._clock, self._skip_invalid = clock or log_time(), skip_invalid
         self._steps = self._clock.steps
-        self._changes = None if encode is None else Changes(encode)
         self._thinned = ThinnedPairs(images_hz)
         self._files = 0
         self.newest_ns = 0
@@ -129,8 +126,12 @@ class Recorder:
         if self._steps != self._clock.steps:
             self._steps = self._clock.steps
             self._log.end_file()
-        # 2. The message, and what changes with it.
+        # 2. Each file has all of what seldom changes.
         stamp_ns, encode = self._clock.segment_unix_ns(message.stamp_ns), self._encode
+        if encode is not None and self._files not in (0, self.state.files):
+            encode.repeat_states()
+        self._files = self.state.files
+        # 3. The message.
         try:
             if isinstance(message, Frame):
                 for frame in self._thinned.take(message):
@@ -138,11 +139,6 @@ class Recorder:
                     self._write([OutgoingMessage(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
             elif encode is not None:
                 self._write(encode(message), stamp_ns)
-                # Each file has all of what seldom changes.
-                if isinstance(message, OdometryUpdate) and self._files != self.state.files:
-                    self._files, self._changes = self.state.files, Changes(encode)
-                if self._changes is not None:
-                    self._write(self._changes(message), stamp_ns)
             self.newest_ns = max(self.newest_ns, stamp_ns)
         except OmnidError:  # for example a stamp that is not a time
             if not self._skip_invalid:

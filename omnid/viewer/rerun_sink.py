@@ -24,7 +24,7 @@ from omnid.core.odometry.stereo_frame import Features
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.plain_text import plain
 from omnid.recordings.recording import Content
-from omnid.sinks.encoder import Changes, Encoder, Outgoing, pose_attachment
+from omnid.sinks.encoder import Encoder, Outgoing, pose_attachment
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
 from omnid.transport.codec import Cloud, Diagnostics, Panorama, Pose, PoseInMap, Scan
@@ -265,12 +265,11 @@ class ReplayDrawing:
     def __init__(self, sink: RerunSink, front_end: FrontEnd) -> None:
         self._sink, self._geometry, self._dense = sink, front_end.geometry, front_end.dense
         self._encode = Encoder(front_end.geometry.rig.T_base_rig, MAP_POINTS)
-        self._changes = Changes(self._encode)
 
     def process(self, message: Outgoing) -> None:
         """Draw a message."""
         attachment = pose_attachment(message) if isinstance(message, OdometryUpdate) else b""
-        for topic, _, payload in (*self._changes(message), *self._encode(message)):
+        for topic, _, payload in self._encode(message):
             if topic in REPLAYED:
                 self._sink.draw(PUBLISHED[topic].decode(payload, attachment if topic == "odom" else b""))
         sink, rig = self._sink, self._geometry.rig

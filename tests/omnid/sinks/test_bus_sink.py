@@ -31,7 +31,7 @@ from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestA
 from omnid.navigation_state import NavigationState
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import PlannerDrive, ReplayDrive
-from omnid.sinks.encoder import Encoder, Outgoing, static_frames
+from omnid.sinks.encoder import Encoder, Outgoing
 from omnid.tracking_state import TrackingState
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PlanarPath, decode_pose
@@ -156,7 +156,7 @@ def test_a_cloud_has_the_most_confident_points_in_their_order() -> None:
 
 def test_the_static_frames_lead_from_the_base_to_the_cameras() -> None:
     rig = replace(make_rig(size=256), T_base_rig=se3.exp([0.1, 0.0, 0.4, 0.0, 0.1, 0.5]))
-    sent = static_frames(Encoder(rig.T_base_rig, 1, unix_ns, rig), 5)
+    sent = next(iter(Encoder(rig.T_base_rig, 1, unix_ns, rig)(odometry(0))))
     found = {}
     for edge in cast("Any", STORE.deserialize_cdr(sent.payload, sent.schema)).transforms:
         t, q = edge.transform.translation, edge.transform.rotation
