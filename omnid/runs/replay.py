@@ -41,7 +41,7 @@ from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing, StatusReport
-from omnid.sinks.files import TrajectoryFile, check_outputs, write_known, write_plan
+from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
@@ -293,9 +293,10 @@ class _Replay:
         in_map, live = (np.array(T, float).reshape(-1, 4, 4) for T in (found, [each.T_map_rig for each in updates]))
         stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
         if path := options.map_tum:
-            self._warnings += write_known(path, stamps_ns, in_map, known)
+            self._warnings += write_trajectory(path, stamps_ns, in_map, known)
         if path := options.map_live_tum:
-            self._warnings += write_known(path, stamps_ns, live, np.array([each.is_known for each in updates], bool))
+            known_live = np.array([each.is_known for each in updates], bool)
+            self._warnings += write_trajectory(path, stamps_ns, live, known_live)
         # 2. All that was found.
         counters = self._counters()
         collected = zip(*self._poses, strict=True) if self._poses else ((), (), (), ())

@@ -31,6 +31,9 @@ GRANTED: Final = {
     "stop": "the route has ended",
 }
 FAILED_S: Final = 3.0  # a motor controller that has failed for this time ends a replay
+NO_MOTOR: Final = (
+    "the motor controller does not answer any more; its own watchdog stops the wheels: check its power and its cable"
+)
 
 
 class LiveDrive:
@@ -70,10 +73,7 @@ def granted_words(request: str, state: NavigationState, reason: str = "") -> str
     state, reason: of the navigation after it.
     """
     verb, _, name = request.partition(" ")
-    words = f"{state}: {reason}" if reason else str(state)
-    if state.is_end and state is not NavigationState.CANCELLED:
-        words = f"nothing is under way ({words})"
-    return GRANTED.get(verb, words).format(name)
+    return GRANTED.get(verb, f"{state}: {reason}" if reason else str(state)).format(name)
 
 
 class ReplayDrive:
@@ -89,7 +89,7 @@ class ReplayDrive:
         """health: of the rig; the wheels stand until the first pairs have shown whether it is right."""
         self._link, self._setpoint, self._T_base_rig = link, setpoint, T_base_rig
         self._health, self._has_begun = health, False
-        self._failed_since_ns = 0  # 0: the motor controller answers
+        self._answered_ns = 0  # when the motor controller had not failed for the last time
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Send a pose and the setpoint; DriverError where the motor controller has failed for FAILED_S."""
@@ -102,12 +102,10 @@ class ReplayDrive:
         self._link.send(TimedSetpoint(now_ns, self._setpoint))
         self._link.receive_waiting()
         # 2. End the run where the motor controller does not come back.
-        if not self._link.statistics.state.failed:
-            self._failed_since_ns = 0
-            return
-        self._failed_since_ns = self._failed_since_ns or now_ns
-        if (now_ns - self._failed_since_ns) * S_PER_NS > FAILED_S:
-            raise _motor_failed()
+        if not self._link.statistics.state.failed or not self._answered_ns:
+            self._answered_ns = now_ns
+        elif (now_ns - self._answered_ns) * S_PER_NS > FAILED_S:
+            raise DriverError(NO_MOTOR)
 
     def finish(self) -> None:
         """Have the wheels slow down to a stop, take the last reports; DriverError where the motor controller failed."""
@@ -115,16 +113,9 @@ class ReplayDrive:
         for _ in self._link.commands():
             pass
         if self._link.statistics.state.failed:
-            raise _motor_failed()
+            raise DriverError(NO_MOTOR)
 
     def counts(self) -> dict[str, int]:
         """Return the commands that were answered, the errors, and how often moving wheels had to stop."""
         state = self._link.statistics.state
         return {"commands": state.sent, "errors": state.errors, "stops": state.stops.total()}
-
-
-def _motor_failed() -> DriverError:
-    return DriverError(
-        "the motor controller does not answer any more; its own watchdog stops the wheels: "
-        "check its power and its cable"
-    )

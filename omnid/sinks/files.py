@@ -14,9 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.mcap_writer import is_locked, lock
-from drivers.logs.open_log import is_log_name
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_whole
@@ -25,26 +23,20 @@ from omnid.formats.tum import tum_row
 from omnid.messages import OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
-# Options of files that are replaced at once -> the ends that their names may have, where they have one.
-REPLACED: Final = {"--cloud": (".ply",), "--plan": (".png",), "--ply": (".ply",), "--grid": (".yaml", ".yml")}
+REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written, and none is another one, an input (name, path) or in use.
 
-    Of a folder that is an input, the logs and images are inputs as well. Leaves no file behind. Raises OmnidError.
+    Leaves no file behind. Raises OmnidError.
     """
     used = {_identity(path): what for what, path in inputs}
-    folders = [folder.resolve() for _, folder in inputs if folder.is_dir()]
     for option, path in outputs:
         wrong = _why_not_written(option, path)
         other = used.setdefault(_identity(path), option)
         if not wrong and other != option and path.exists() == path.is_file():
             wrong = f"this is {other} as well"
-        folder = next((folder for folder in folders if folder in path.resolve().parents), None)
-        is_image = path.suffix.lower() in IMAGE_SUFFIXES and option != "--plan"
-        if not wrong and folder is not None and (is_image or is_log_name(path.name)) and path.is_file():
-            wrong = f"this is a file of {folder}, which is read"
         if wrong:
             raise OmnidError(f"{option} {path}: {wrong}; name another file")
 
@@ -67,16 +59,13 @@ def _identity(path: Path) -> tuple[int, int] | str:
 
 def _why_not_written(option: str, path: Path) -> str:
     """Return why a file cannot be written; empty if it can."""
-    endings = REPLACED.get(option, ())
     try:
         if path.is_dir():
             return "expected a file to write, found a folder"
         if not path.parent.is_dir():
             return f"there is no folder {path.parent}"
-        if endings and path.suffix and path.suffix.lower() not in endings:
-            return f"expected a name that ends in {endings[0]}"
         if path.exists() and not path.is_file():  # not opened: a pipe that is opened and closed would end its reader
-            return "expected a file that can be replaced, found a device or a pipe" if endings else ""
+            return "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
         is_new = not path.exists()
         path.open("ab").close()
         if is_new:
@@ -106,16 +95,20 @@ class TrajectoryFile:
     def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
         """Write the row of a pose (4, 4). Raises OmnidError."""
         try:
-            if self._file is None:
-                self._file = self._path.open("wb", buffering=0)
-                lock(self._file)
             row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
-            if self._file.write(row) != len(row):
-                self._file.truncate(self._whole_bytes)  # remove the part of a row
+            if self.opened().write(row) != len(row):
+                self.opened().truncate(self._whole_bytes)  # remove the part of a row
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self._whole_bytes += len(row)
         except OSError as error:
-            raise _no_longer_written(self._path, error) from error
+            raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error
+
+    def opened(self) -> FileIO:
+        """Return the file, which is begun anew when it is first asked for."""
+        if self._file is None:
+            self._file = self._path.open("wb", buffering=0)
+            lock(self._file)
+        return self._file
 
     def finish(self) -> None:
         """Close the file."""
@@ -123,37 +116,30 @@ class TrajectoryFile:
             self._file.close()
 
 
-def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
-    """Write poses (N, 4, 4) as TUM; without poses an existing file stays as it is. Raises OmnidError."""
+def write_trajectory(
+    path: Path,
+    stamps_ns: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    known: NDArray[np.bool_] | None = None,
+) -> list[str]:
+    """Write poses (N, 4, 4) as TUM, of those in a map the known ones (N,); return warnings about the others.
+
+    Without poses an existing file stays as it is. Raises OmnidError.
+    """
+    known = np.ones(len(stamps_ns), bool) if known is None else known
     file = TrajectoryFile(path)
     try:
-        for stamp_ns, T in zip(stamps_ns.tolist(), poses, strict=True):
-            file.write(stamp_ns, T)
+        if len(stamps_ns):
+            file.opened()
+        for stamp_ns, T, is_known in zip(stamps_ns.tolist(), poses, known, strict=True):
+            if is_known:
+                file.write(stamp_ns, T)
     finally:
         file.finish()
-
-
-def write_known(
-    path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64], known: NDArray[np.bool_]
-) -> list[str]:
-    """Write those of poses in the map (N, 4, 4) that are known (N,), as TUM; return warnings about the others.
-
-    Raises OmnidError.
-    """
-    if len(poses) and not known.any():
-        try:
-            path.write_bytes(b"")  # no poses of an earlier run
-        except OSError as error:
-            raise _no_longer_written(path, error) from error
-    write_trajectory(path, stamps_ns[known], poses[known])
     if known.all():
         return []
     left_out = f"{len(known) - known.sum()} of {len(known)} poses are left out"
     return [f"{path}: {left_out}: no place of the map was recognised there, so it is not known where in it they are"]
-
-
-def _no_longer_written(path: Path, error: OSError) -> OmnidError:
-    return OmnidError(f"{path}: can no longer be written: {error.strerror or error}")
 
 
 def write_plan(
