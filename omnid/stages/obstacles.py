@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -22,7 +23,7 @@ from omnid.core.obstacles.posterior import thin_things_m
 from omnid.core.obstacles.ray_scans import RayScans
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.obstacles.unwatched import Unwatched
-from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate, Panoramas
+from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import STAMP_JITTER_NS
@@ -65,27 +66,19 @@ class CameraFloor:
         return np.asarray(floor.T_floor_base(self.view) @ self._T_base_rig)
 
     def stats(self) -> dict[str, object]:
-        """Return the figures of the floor, where it is known, and where that comes from."""
+        """Return the figures of the floor, where it is known, and what is wrong."""
         floor = self.floor
         figures: dict[str, object] = {}
         if floor is not None:  # height of the lower viewpoint
-            figures = {
-                "height_m": floor.height_m,
-                "sigma_m": floor.sigma_m,
-                "tilt_deg": math.degrees(floor.tilt_rad),
-            }
-        if self.stated is not None:
-            return figures | {"_words": "the rig states the height of the cameras"}
-        known = "that which the images show" if figures else "not known: nothing is free"
-        return figures | {"_warning": f"the height of the cameras is {known}"}
+            tilt_deg = math.degrees(floor.tilt_rad)
+            figures = {"height_m": floor.height_m, "sigma_m": floor.sigma_m, "tilt_deg": tilt_deg}
+        return figures | {"_warning": self.summary(), "_words": "the rig states the height of the cameras"}
 
     def summary(self) -> str:
         """Return one sentence about a height that the rig does not state; empty where it does."""
         if self.stated is not None:
             return ""
-        floor, found = self._estimator.floor, "do not show the floor: map, grid and obstacles call nothing free"
-        if floor is not None:
-            found = f"show the floor {floor.height_m:.2f} m (sigma {floor.sigma_m:.2f}) below the lower one"
+        found = "show the floor" if self.floor else "do not show the floor: map, grid and obstacles call nothing free"
         return f"the rig does not state the height of the cameras, and the images {found}; {ADVICE}"
 
 
@@ -107,35 +100,42 @@ class PairScans:
 
     def add(self, odometry: OdometryUpdate, camera_floor: CameraFloor) -> ObstacleScan:
         """Add the evidence of a pair; return the scan at it, which is unknown while the floor or the pose is."""
-        # 1. Forget the grid and the tracks where odometry has begun again.
-        if odometry.reset_counter != self._resets:
+        # 1. Forget the grid and the tracks where odometry has begun again; while it is lost the grid stays: it holds
+        #    again once odometry recognises its landmarks.
+        is_lost = odometry.state is TrackingState.LOST
+        if is_again := odometry.reset_counter != self._resets:
             self.scans.begin_again()
-            self._tracker.clear()
             self._resets = odometry.reset_counter
+        if is_again or is_lost:
+            self._tracker.clear()
         panoramas, self.scans.belief = odometry.depth.panoramas, None
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
-        unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
+        tiles, unwatched = panoramas.tiles, self._unwatched.sectors(panoramas.tiles.unknown)
         unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
-        if odometry.state is TrackingState.LOST:
-            # The grid stays: it holds again once odometry recognises its landmarks.
-            self._tracker.clear()
+        # 2. Tables of the floor.
+        floor = camera_floor.floor
+        if is_lost or floor is None:
             return unknown
-        if not self._has_tables(camera_floor, panoramas):
-            return unknown
-        # 2. The scan by the images, without their dead and blind parts.
-        lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
-        pose = transform(planar(T_odom_base))
+        if floor is not self._of_floor:
+            self._of_floor = floor
+            T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
+            self.scans.set_floor(T_rect_floor, panoramas.visible)
+        # 3. The scan by the images, without their dead and blind parts.
+        lost = tiles.lost_pixels(panoramas.visible.shape)
         scan = self.scans.add(odometry.stamp_ns, T_odom_base, panoramas.lower, panoramas.upper, lost)
-        # 3. The moving obstacles.
-        scan.arrivals.ranges_m[self._unwatched.directions(panoramas.tiles.unknown)] = np.nan
-        moving = self._tracker.update(odometry.stamp_ns, self.scans.grid.viewpoint(pose), scan.arrivals)
-        # Nothing is said of directions in which the images show nothing to rely on.
-        ranges_m, sigma_m, free_m = (
-            np.where(unwatched, none, known)
-            for none, known in ((UNKNOWN, scan.ranges_m), (UNKNOWN, scan.sigma_m), (NOT_FREE, scan.free_m))
+        # 4. The moving obstacles.
+        scan.arrivals.ranges_m[self._unwatched.directions(tiles.unknown)] = np.nan
+        viewpoint = self.scans.grid.viewpoint(transform(planar(T_odom_base)))
+        moving = self._tracker.update(odometry.stamp_ns, viewpoint, scan.arrivals)
+        # 5. Nothing is said of directions in which the images show nothing to rely on.
+        return replace(
+            unknown,
+            ranges_m=np.where(unwatched, UNKNOWN, scan.ranges_m),
+            sigma_m=np.where(unwatched, UNKNOWN, scan.sigma_m),
+            free_m=np.where(unwatched, NOT_FREE, scan.free_m),
+            moving=moving,
+            grid=scan.grid,
         )
-        found = ranges_m, sigma_m, free_m, T_odom_base, moving, unwatched, scan.grid
-        return ObstacleScan(odometry.seq, odometry.stamp_ns, *found)
 
     @property
     def thin_m(self) -> FreeRanges:
@@ -145,15 +145,6 @@ class PairScans:
         """
         belief = self.scans.belief
         return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief, self.scans.grid.risk)
-
-    def _has_tables(self, camera_floor: CameraFloor, panoramas: Panoramas) -> bool:
-        """Make the tables of the floor; return False without one."""
-        floor = camera_floor.floor
-        if floor is not None and floor is not self._of_floor:
-            self._of_floor = floor
-            T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
-            self.scans.set_floor(T_rect_floor, panoramas.visible)
-        return floor is not None
 
 
 class Obstacles:
@@ -169,22 +160,16 @@ class Obstacles:
 
     def process(self, odometry: OdometryUpdate) -> ObstacleScan | None:
         """Return the scan at a pair, None where it is not due."""
-        if not self._is_due(odometry):
+        # 1. At the rate of the configuration; stamps that step back are of another part of a log.
+        if self._last_ns is not None and 0 <= odometry.stamp_ns - self._last_ns < self._period_ns - STAMP_JITTER_NS:
             return None
         self._last_ns = odometry.stamp_ns
-        # 1. The floor, from points of pairs whose pose is known, until it is known.
+        # 2. The floor, from points of pairs whose pose is known, until it is known.
         if self.floor.wants_points and odometry.state is not TrackingState.LOST:
             # As they were matched: the fit leaves out by itself what is no floor.
             self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
-        # 2. The scan.
+        # 3. The scan.
         return self._scans.add(odometry, self.floor)
-
-    def _is_due(self, odometry: OdometryUpdate) -> bool:
-        """True if a pair is to give a scan."""
-        if self._last_ns is None:
-            return True
-        since_ns = odometry.stamp_ns - self._last_ns
-        return since_ns < 0 or since_ns >= self._period_ns - STAMP_JITTER_NS
 
 
 def controller_scan(scan: ObstacleScan) -> ControllerScan:

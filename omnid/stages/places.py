@@ -5,38 +5,19 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import Config
-from omnid.core.mapping.range_scan import (
-    MAX_RANGE_M,
-    SECTORS,
-    FreeRanges,
-    RangeScan,
-    ScanLimits,
-    point_scan,
-    seen_from,
-)
+from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, FreeRanges, RangeScan, point_scan, seen_from
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.core.navigation.requests import NavigationCommand, TaughtRoute
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
-from omnid.messages import (
-    DensePoints,
-    MapCopy,
-    MapKeyframes,
-    ObstacleScan,
-    OdometryUpdate,
-    PlaceUpdate,
-    SaveMap,
-    StereoDepth,
-)
+from omnid.messages import DensePoints, MapCopy, MapKeyframes, ObstacleScan, OdometryUpdate, PlaceUpdate, SaveMap
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import CameraFloor, PairScans
@@ -44,10 +25,6 @@ from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
-
-
-# Time between two counts, which take 1 ms for 1,000 keyframes; the status comes no oftener.
-COUNTED_NS: Final = NS_PER_S
 
 
 class Places:
@@ -74,15 +51,14 @@ class Places:
             geometry.model(config.odometry.noise_px), config.places.limits, places, localize_only=localize_only
         )
         self._T_rig_rect = geometry.T_rig_rect
+        self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._limits = config.obstacles.scan
         self._scans = PairScans(geometry, config.obstacles.scan)  # at keyframes
         self.floor = CameraFloor(geometry.rig, config.obstacles.scan.floor_m)
-        self._T_rect_rig = se3.inverse(self._T_rig_rect)
-        self._to_rig = se3.adjoint(self._T_rig_rect)
         self.state = MapState.ODOMETRY_ONLY  # state of the newest pose
-        self.counts = self._localiser.counts  # sizes and counters of the map; each second, and at the end
-        self._counted_ns = 0
-        self._keyframes: tuple[object, MapKeyframes] | None = None  # what they depend on, and they
+        self.counts = self._localiser.counts  # sizes and counters of the map
+        self._shown: object = None  # scans of the map when these were counted and its keyframes were copied
+        self._keyframes: MapKeyframes | None = None
         self._copy_ns, self._copied_ns = round(copy_s * NS_PER_S), 0
         self._copy_wanted = False
         self._copy: MapCopy | None = None
@@ -92,50 +68,40 @@ class Places:
         """Return the places whose poses are known relative to the first one: what can be saved."""
         return self._localiser.map()
 
-    def process(self, message: OdometryUpdate | SaveMap | NavigationCommand) -> PlaceUpdate | None:
-        """Return the pose in the map at a pair.
-
-        Requests to write the map, and routes that were written, for which the map must be, have it copied then.
-        """
-        match message:
-            case SaveMap():
-                self._copy_wanted = True
-                self._asked.append(message.id)
-                return None
-            case NavigationCommand():
-                self._copy_wanted |= isinstance(message.request, TaughtRoute) and not message.refusal
-                return None
-        return self._localised(message)
-
-    def _localised(self, odometry: OdometryUpdate) -> PlaceUpdate:
+    def process(self, message: OdometryUpdate | SaveMap) -> PlaceUpdate | None:
+        """Return the pose in the map at a pair. A request to save the map has the next one carry a copy."""
+        if isinstance(message, SaveMap):
+            self._copy_wanted = True
+            self._asked.append(message.id)
+            return None
+        odometry, places = message, self._localiser.places
         # 1. The pose in the map.
         pose = self._localiser.process(self._frame(odometry))
         self.state = pose.state
-        # 2. Copies for other threads, which never read the map itself.
+        # 2. What other threads need of the map, which they never read itself.
+        scans = self._localiser.scans()
+        if self._keyframes is None or scans is not self._shown:
+            ids = sorted(places.keyframes)
+            stamps_ns = {id: places.keyframes[id].stamp_ns for id in ids}
+            self._keyframes = MapKeyframes(stamps_ns, {id: places.poses[id] for id in ids})
+            self._shown, self.counts = scans, self._localiser.counts
         self._copied_ns = self._copied_ns or odometry.stamp_ns
         if self._copy_wanted or (self._copy_ns and odometry.stamp_ns - self._copied_ns >= self._copy_ns):
             self._copy_wanted, self._copied_ns = False, odometry.stamp_ns
-            places = self._localiser.places
             self._copy = MapCopy(places.part(places.keyframes), tuple(self._asked))
-        if odometry.stamp_ns >= self._counted_ns + COUNTED_NS:
-            self._counted_ns, self.counts = odometry.stamp_ns, self._localiser.counts
         # 3. The message, in the frame of the rig.
-        T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
-        T_map_rig = T_map_odom @ odometry.T_odom_rig
-        covariance = self._to_rig @ pose.covariance @ self._to_rig.T
-        T_keyframe_rig = self._T_rig_rect @ pose.T_keyframe_rect @ self._T_rect_rig
-        scans = self._localiser.scans()
+        T_map_odom, to_rig = self._in_rig(pose.T_map_odom), se3.adjoint(self._T_rig_rect)
         return PlaceUpdate(
             odometry.seq,
             odometry.stamp_ns,
             T_map_odom,
-            T_map_rig,
-            covariance,
+            T_map_odom @ odometry.T_odom_rig,
+            to_rig @ pose.covariance @ to_rig.T,
             pose.state,
             pose.keyframe,
-            T_keyframe_rig,
+            self._in_rig(pose.T_keyframe_rect),
             scans,
-            self._copied_keyframes(scans),
+            self._keyframes,
             pose.is_known,
             self._copy,
         )
@@ -144,17 +110,10 @@ class Places:
         """Return the state of the pose in the map, and the sizes and counters of the map."""
         return {"state": self.state, **self.counts}
 
-    def finish(self) -> list[PlaceUpdate]:
-        """Count at the end."""
-        self.counts = self._localiser.counts
-        return []
-
     def corrected(self, update: PlaceUpdate) -> Array:
         """Return T_map_rig (4, 4) of an earlier pose by the map of now; unchanged if its keyframe was dropped."""
         T_map_rect = self._localiser.places.poses.get(update.keyframe)
-        if T_map_rect is None:
-            return update.T_map_rig
-        return np.asarray(self._T_rig_rect @ T_map_rect @ self._T_rect_rig @ update.T_keyframe_rig)
+        return update.T_map_rig if T_map_rect is None else self._in_rig(T_map_rect) @ update.T_keyframe_rig
 
     def known(self, updates: Sequence[PlaceUpdate]) -> NDArray[np.bool_]:
         """Return at which of earlier poses (N,) it is known now where odom lay in the map that can be saved."""
@@ -164,16 +123,9 @@ class Places:
             np.bool_,
         )
 
-    def _copied_keyframes(self, scans: object) -> MapKeyframes:
-        """Return the keyframes of the map; scans: the same object while the map stays."""
-        if self._keyframes is None or self._keyframes[0] is not scans:
-            places = self._localiser.places
-            ids = sorted(places.keyframes)
-            self._keyframes = (
-                scans,
-                MapKeyframes({id: places.keyframes[id].stamp_ns for id in ids}, {id: places.poses[id] for id in ids}),
-            )
-        return self._keyframes[1]
+    def _in_rig(self, T: Array) -> Array:
+        """Return a pose (4, 4) of the rectified frame as one of the rig."""
+        return np.asarray(self._T_rig_rect @ T @ self._T_rect_rig)
 
     def _frame(self, odometry: OdometryUpdate) -> OdometryFrame:
         """Return the frame in terms of the rectified frame."""
@@ -190,52 +142,42 @@ class Places:
             odometry.state is TrackingState.LOST,
             odometry.reset_counter,
             odometry.is_keyframe,
-            lambda: self._scan(depth),
-            lambda: self._free(odometry),
+            lambda: self._ranges(odometry),
         )
 
-    def _free(self, odometry: OdometryUpdate) -> FreeRanges:
-        """Return the free ranges of a pair."""
-        scan = self._scans.add(odometry, self.floor)
-        return keyframe_free(scan, self._scans.thin_m, self.floor, self._T_rig_rect)
-
-    def _scan(self, depth: StereoDepth) -> RangeScan:
-        """Return the range scan of a pair."""
-        dense = self._dense.of(depth)
+    def _ranges(self, odometry: OdometryUpdate) -> tuple[RangeScan, FreeRanges]:
+        """Return the range scan of a pair, and up to where floor was seen."""
+        dense = self._dense.of(odometry.depth)
         self.floor.add(dense)
-        return keyframe_scan(dense, self.floor, self._T_rig_rect, self._limits)
+        scan = self._scans.add(odometry, self.floor)
+        return keyframe_ranges(dense, scan, self._scans.thin_m, self.floor, self._T_rig_rect, self._limits)
 
 
-def keyframe_scan(
-    depth: DensePoints, camera_floor: CameraFloor, T_rig_rect: Array, settings: ScanSettings
-) -> RangeScan:
-    """Return the ranges (SECTORS,) by azimuth in the rectified frame, turned level; all unknown without a floor."""
-    floor = camera_floor.floor
-    if floor is None:
-        return np.full(SECTORS, np.nan, np.float32)
-    T_floor_rig = camera_floor.T_floor_rig(floor)
-    T_floor_rect = T_floor_rig @ T_rig_rect
-    points = se3.apply(_T_level_floor(T_floor_rect) @ T_floor_rig, depth.points)
-    view = np.array([0.0, 0.0, T_floor_rect[2, 3]])
-    limits = ScanLimits(settings.heights_m, math.radians(settings.tilt_deg), MAX_RANGE_M, settings.min_points)
-    ranges = point_scan(points, np.sqrt(depth.variance_m2), view, limits, floor.sigma_m)
-    return np.where(np.isfinite(ranges), ranges, np.float32(np.nan))
+def keyframe_ranges(
+    depth: DensePoints,
+    scan: ObstacleScan,
+    thin_m: FreeRanges,
+    camera_floor: CameraFloor,
+    T_rig_rect: Array,
+    settings: ScanSettings,
+) -> tuple[RangeScan, FreeRanges]:
+    """Return the ranges of a keyframe and up to where its floor is free, (SECTORS,) by azimuth in the rectified frame.
 
-
-def keyframe_free(scan: ObstacleScan, thin_m: FreeRanges, camera_floor: CameraFloor, T_rig_rect: Array) -> FreeRanges:
-    """Return the range up to which the obstacle scan at a keyframe is free, (SECTORS,) as its range scan.
-
-    thin_m (SECTORS,): where something thin may begin to hide the floor, inf: nowhere; there they are negative.
+    They are turned level, and those of the floor below the lower viewpoint. scan: of obstacles at the keyframe.
+    thin_m (SECTORS,): where something thin may begin to hide the floor, inf: nowhere; there the free ones are negative.
     """
     floor = camera_floor.floor
     if floor is None:
-        return np.zeros(SECTORS, np.float32)
-    free_m = seen_from(scan.free_m, _T_level_floor(camera_floor.T_floor_rig(floor) @ T_rig_rect))
-    free_m = np.minimum(free_m, np.float32(MAX_RANGE_M))
-    return np.where(np.isfinite(thin_m), -np.minimum(free_m, thin_m), free_m)
-
-
-def _T_level_floor(T_floor_rect: Array) -> Array:
-    """Return the transform to the level frame below the lower viewpoint, with the heading of the rectified frame."""
+        return np.full(SECTORS, np.nan, np.float32), np.zeros(SECTORS, np.float32)
+    # 1. The level frame below the lower viewpoint, with the heading of the rectified frame.
+    T_floor_rig = camera_floor.T_floor_rig(floor)
+    T_floor_rect = T_floor_rig @ T_rig_rect
     heading = se3.rotation_exp(np.array([0.0, 0.0, float(se3.yaw(T_floor_rect))]))
-    return se3.inverse(se3.transform(heading, np.array([*T_floor_rect[:2, 3], 0.0])))
+    T_level_floor = se3.inverse(se3.transform(heading, np.array([*T_floor_rect[:2, 3], 0.0])))
+    # 2. The nearest obstacles by stereo.
+    points, view = se3.apply(T_level_floor @ T_floor_rig, depth.points), np.array([0.0, 0.0, T_floor_rect[2, 3]])
+    limits = settings.heights_m, math.radians(settings.tilt_deg), settings.min_points
+    ranges = point_scan(points, np.sqrt(depth.variance_m2), view, *limits, floor.sigma_m)
+    # 3. The free floor by the obstacle scan.
+    free_m = np.minimum(seen_from(scan.free_m, T_level_floor), np.float32(MAX_RANGE_M))
+    return ranges, np.where(np.isfinite(thin_m), -np.minimum(free_m, thin_m), free_m)

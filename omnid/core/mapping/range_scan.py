@@ -9,7 +9,7 @@ stereo is the same at all ranges (sigma_r = r^2 / (f t) sigma_d).
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,27 +80,28 @@ def fill_gaps(scan: RangeScan) -> RangeScan:
     return filled
 
 
-class ScanLimits(NamedTuple):
-    """Limits of what is an obstacle, as the settings obstacles.scan give them."""
-
-    heights_m: tuple[float, float]  # range of heights above the floor
-    tilt_rad: float  # sigma of the base's tilt against the floor
-    max_range_m: float
-    min_points: int  # least number of points of an obstacle
-
-
-def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float = 0.0) -> RangeScan:
+def point_scan(
+    points: Array,
+    sigma_m: Array,
+    view: Array,
+    heights_m: tuple[float, float],
+    tilt_rad: float,
+    min_points: int,
+    floor_sigma_m: float = 0.0,
+) -> RangeScan:
     """Return the scan (SECTORS,) of points (N, 3) [m] in the level frame of the base; z is the height above the floor.
 
-    A range is that of the nearest obstacle, m; inf: something beyond the longest range was seen; NaN: unknown.
+    A range is that of the nearest obstacle up to MAX_RANGE_M, m; NaN: unknown.
 
-    sigma_m (N,): of the points, along the rays; view (3,): the viewpoint in that frame; floor_sigma_m: of the floor.
+    sigma_m (N,): of the points, along the rays; view (3,): the viewpoint in that frame; heights_m: of obstacles above
+    the floor; tilt_rad: sigma of the base's tilt against it; min_points: least number of points of an obstacle;
+    floor_sigma_m: of the height of the floor.
     """
     # 1. The points within the band of heights, by a margin for the noise of stereo and the tilt of the base.
-    low, high = limits.heights_m
+    low, high = heights_m
     across2, rise2 = ((points[:, :2] - view[:2]) ** 2).sum(axis=1), (points[:, 2] - view[2]) ** 2
     of_stereo2 = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
-    margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + limits.tilt_rad**2 * across2 + floor_sigma_m**2)
+    margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + tilt_rad**2 * across2 + floor_sigma_m**2)
     x, y, z = points.T
     ranges = np.hypot(x, y)
     chosen = (ranges > NEAREST_M) & np.isfinite(sigma_m) & (z - margin > low) & (z + margin < high)
@@ -113,16 +114,11 @@ def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, f
     count, inverse = (each + np.pad(each[:, 1:], ((0, 0), (0, 1))) for each in sums)
     # 3. The nearest bin that enough points support, those of the neighbouring sectors included.
     of_neighbours = count + np.roll(count, 1, axis=0) + np.roll(count, -1, axis=0)
-    supported = (of_neighbours >= limits.min_points) & (count > 0)
-    limit = bins - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from this one on lie beyond
+    supported = (of_neighbours >= min_points) & (count > 0)
     first = supported.argmax(axis=1)[:, None]
-    is_near = supported.any(axis=1) & (first[:, 0] < limit)
     total, of_inverse = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))
-    found = np.divide(total, of_inverse, out=np.full(SECTORS, np.nan), where=is_near)
-    # The last two bins reach beyond the longest range.
-    beyond = (found > limits.max_range_m) | (~is_near & supported.any(axis=1))
-    scan = fill_gaps(np.where(beyond, np.nan, found).astype(np.float32))
-    return np.where(beyond & ~np.isfinite(scan), np.float32(np.inf), scan)
+    found = np.divide(total, of_inverse, out=np.full(SECTORS, np.nan), where=supported.any(axis=1))
+    return fill_gaps(np.where(found > MAX_RANGE_M, np.nan, found).astype(np.float32))
 
 
 def _sectors(x: Array, y: Array) -> Counts:

@@ -66,8 +66,8 @@ class OdometryFrame:
     lost: bool
     resets: int  # gaps of unknown motion so far
     is_keyframe: bool  # True if its dense depth is known
-    scan: Callable[[], NDArray[np.float32]]  # returns distances (SECTORS,) [m], see mapping/range_scan.py
-    free_m: Callable[[], NDArray[np.float32]]  # returns up to where floor was seen, asked once at a keyframe
+    # Returns distances (SECTORS,) [m] and up to where floor was seen, see mapping/range_scan.py; asked at a keyframe.
+    ranges: Callable[[], tuple[NDArray[np.float32], NDArray[np.float32]]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,7 +299,7 @@ class MapLocaliser:
             ties = [id for id in self.places.keyframes if id not in self._fixed]
             for id in ties[: len(ties) - TIES + 1]:
                 self.places.drop(id)
-        scan, free_m = frame.scan().astype(np.float16), frame.free_m().astype(np.float16)
+        scan, free_m = (ranges.astype(np.float16) for ranges in frame.ranges())
         of_odometry = frame.stamp_ns, frame.T_odom_rect, frame.covariance
         keyframe = PlaceKeyframe(self.places.next_id, self._session, *of_odometry, small, scan, free_m, features)
         link = None if self._newest is None else Link.by_odometry(self._newest, keyframe)

@@ -18,7 +18,7 @@ from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import CameraFloor, PairScans
-from omnid.stages.places import keyframe_free, keyframe_scan
+from omnid.stages.places import keyframe_ranges
 from omnid.tracking_state import TrackingState
 from tests.omnid.core import test_floor
 from tests.omnid.core.obstacles.drawn_floor import (
@@ -172,6 +172,8 @@ def test_what_is_known_stays_at_its_place_in_odom_as_the_base_moves(x_m: float, 
 ROOM_HEIGHT_M = test_floor.HEIGHT_M
 BOX_M, WALL_M = 1.4, 2.4
 AHEAD = np.abs(azimuths()) < 0.25  # of the rig, whose x is forward
+UNKNOWN_M, OPEN_M = np.full(SECTORS, np.nan, np.float32), np.full(SECTORS, np.inf, np.float32)
+NOTHING = ObstacleScan(0, 0, UNKNOWN_M, UNKNOWN_M, np.zeros(SECTORS, np.float32), np.eye(4))
 
 
 def depth(T_rig_level: np.ndarray, with_floor: bool = True) -> DensePoints:
@@ -198,7 +200,7 @@ def test_a_low_box_before_a_wall_is_the_nearest_obstacle(height_m: float, tilt_d
     rig = replace(make_rig(), T_base_rig=stated @ se3.inverse(tilt) if height_m else np.eye(4))
     camera_floor, seen = CameraFloor(rig, 0.0), depth(tilt)
     camera_floor.add(seen)
-    scan = keyframe_scan(seen, camera_floor, np.eye(4), ScanSettings())
+    scan, _ = keyframe_ranges(seen, NOTHING, OPEN_M, camera_floor, np.eye(4), ScanSettings())
     np.testing.assert_allclose(scan[AHEAD], BOX_M, atol=0.08)
     np.testing.assert_allclose(scan[np.abs(azimuths()) > 0.5], WALL_M, atol=0.15)
     assert bool(camera_floor.summary()) != bool(height_m)
@@ -207,11 +209,11 @@ def test_a_low_box_before_a_wall_is_the_nearest_obstacle(height_m: float, tilt_d
 @pytest.mark.parametrize("height_m", [ROOM_HEIGHT_M, 0.0])
 def test_free_floor_ends_at_what_is_narrow_and_is_negative_there(height_m: float) -> None:
     stated = se3.transform(np.eye(3), [0.0, 0.0, height_m])
-    unknown = np.full(SECTORS, np.nan, np.float32)
     free_m, narrow_m = np.full(SECTORS, 2.0, np.float32), np.full(SECTORS, np.inf, np.float32)
     narrow_m[[1, 3]] = 1.5, 3.0
-    scan = ObstacleScan(0, 0, unknown, unknown, free_m, np.eye(4), (), unwatched=())
-    found = keyframe_free(scan, narrow_m, CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0), np.eye(4))
+    camera_floor = CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0)
+    scan = replace(NOTHING, free_m=free_m)
+    _, found = keyframe_ranges(depth(np.eye(4)), scan, narrow_m, camera_floor, np.eye(4), ScanSettings())
     expected = [2.0, -1.5, 2.0, -2.0, 2.0] if height_m else [0.0] * 5
     np.testing.assert_allclose(found[:5], expected, atol=1e-3)
 
@@ -219,5 +221,6 @@ def test_free_floor_ends_at_what_is_narrow_and_is_negative_there(height_m: float
 def test_without_a_floor_nothing_is_known_and_the_summary_names_it() -> None:
     camera_floor, seen = CameraFloor(make_rig(), 0.0), depth(np.eye(4), with_floor=False)
     camera_floor.add(seen)
-    assert np.isnan(keyframe_scan(seen, camera_floor, np.eye(4), ScanSettings())).all()
+    scan, _ = keyframe_ranges(seen, NOTHING, OPEN_M, camera_floor, np.eye(4), ScanSettings())
+    assert np.isnan(scan).all()
     assert "call nothing free" in camera_floor.summary()

@@ -12,7 +12,6 @@ from omnid.core.mapping.range_scan import (
     SECTORS,
     FreeRanges,
     RangeScan,
-    ScanLimits,
     azimuths,
     fill_gaps,
     point_scan,
@@ -164,14 +163,14 @@ def test_it_grows_and_is_bounded() -> None:
 
 FLOOR_M = -1.2
 VIEW = np.zeros(3)
-LIMITS = ScanLimits((0.06, 1.7), np.radians(0.5), 6.0, 6)
 
 
 def scan_seen(*parts: np.ndarray, sigma_of_m2: float = 0.01) -> np.ndarray:
     """Return the scan of points, whose sigma is so many metres per square metre of range."""
     points = np.vstack(parts)
     above_floor = points - [0.0, 0.0, FLOOR_M]
-    return point_scan(above_floor, sigma_of_m2 * (points**2).sum(axis=1), VIEW - [0.0, 0.0, FLOOR_M], LIMITS)
+    limits = (0.06, 1.7), np.radians(0.5), 6
+    return point_scan(above_floor, sigma_of_m2 * (points**2).sum(axis=1), VIEW - [0.0, 0.0, FLOOR_M], *limits)
 
 
 def arc(range_m: float, degrees: tuple[float, float], heights_m: tuple[float, float], count: int = 2000) -> np.ndarray:

@@ -57,8 +57,7 @@ def odometry(
                 False,
                 resets,
                 True,
-                lambda: np.full(SECTORS, np.nan, np.float32),
-                lambda: np.zeros(SECTORS, np.float32),
+                lambda: (np.full(SECTORS, np.nan, np.float32), np.zeros(SECTORS, np.float32)),
             )
         )
     return found
