@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import argparse
 import math
+import select
+import signal
+import sys
 from collections.abc import Callable
 from typing import Final
 
-from omnid.client import Answer, Driver
+from omnid.client import CONNECT_S, Answer, Driver, NavigationReport, Robot
 from omnid.commands.options import ROBOT, SETTINGS, command, settings_of
 from omnid.core.navigation.requests import route_name
+from omnid.engine.logging_setup import HANDLER
+from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.monitor import navigation
-from omnid.monitor.navigation import connected, drive_to_end, granted, record_until_enter
 from omnid.monitor.teleop import teleoperate
+from omnid.navigation_state import NavigationState
 
 NAME: Final = "name NAME  letters, digits, '-' and '_'"
 NO_WAIT: Final = "--no-wait  end as soon as the robot has accepted it"
@@ -27,7 +32,7 @@ def arm(args: argparse.Namespace) -> int:
       arm
       arm --robot rover --connect tcp/robot:7447
     """
-    with connected(settings_of(args).bus) as robot:
+    with _connected(args) as robot:
         answer = robot.driver().arm()
     print(f"{robot.name} is {answer.text}" if answer.done else f"{robot.name} refuses: {answer.text}")
     return int(not answer.done)
@@ -106,9 +111,30 @@ def teach(args: argparse.Namespace) -> int:
       route teach morning --replace
     """
     name = route_name(args.name)
-    with connected(settings_of(args).bus) as robot:
-        granted(robot, robot.driver().route(f"teach {name} replace" if args.replace else f"teach {name}"))
-        return record_until_enter(robot, name)
+    with _connected(args) as robot:
+        # 1. Begin.
+        driver = robot.driver()
+        granted(robot, driver.route(f"teach {name} replace" if args.replace else f"teach {name}"))
+        reports = robot.subscribe(NavigationReport)
+        print(f"records {name}: drive it; Enter writes it, Ctrl-C drops it", flush=True)
+        # 2. Show its length until Enter or Ctrl-C.
+        try:
+            while not select.select([sys.stdin], [], [], 0)[0]:
+                report = reports.wait(navigation.REPEAT_S)
+                if report is not None and report.teaching != name:
+                    raise OmnidError(f"the recording of {name} has ended: {report.refusal or 'by another program'}")
+                if report is not None:
+                    HANDLER.show(f"{report.taught_m:.1f} m")
+            sys.stdin.readline()
+            granted(robot, driver.route("finish"))
+        except KeyboardInterrupt:
+            driver.route("stop")
+            HANDLER.show("")
+            print(f"{name} is dropped")
+            return 130
+    HANDLER.show("")
+    print(f"{name} is written")
+    return 0
 
 
 @command(NAME, NO_WAIT, ROBOT, SETTINGS)
@@ -141,18 +167,54 @@ def end_route(args: argparse.Namespace) -> int:
 
 def ask(args: argparse.Namespace, *requests: Callable[[Driver], Answer]) -> int:
     """Send requests to the robot, one after the other, and print the last answer. Raise OmnidError with a refusal."""
-    with connected(settings_of(args).bus) as robot:
+    with _connected(args) as robot:
         driver = robot.driver()
         answers = [granted(robot, request(driver)) for request in requests]
     print(answers[-1])
     return 0
 
 
+def granted(robot: Robot, answer: Answer) -> str:
+    """Return what the answer says. Raise OmnidError with the refusal."""
+    if not answer.done:
+        raise OmnidError(f"the robot {robot.name} refuses: {answer.text}")
+    return answer.text
+
+
+def _connected(args: argparse.Namespace) -> Robot:
+    return Robot(settings=settings_of(args).bus, timeout_s=CONNECT_S)
+
+
 def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int:
-    """Ask for a drive and show it until its end, or with --no-wait until the robot has accepted it."""
-    with connected(settings_of(args).bus) as robot:
+    """Ask for a drive and show it until its end, or with --no-wait until the robot has accepted it.
+
+    On a terminal it is one line that is rewritten, else a line for each new state. Ctrl-C, a terminal that closes and
+    other ends of this program cancel it, also while the robot has not answered yet.
+    """
+    report, shown, is_terminal = NavigationReport(), "", sys.stdout.isatty()
+    with _connected(args) as robot:
         driver = robot.driver()
-        if not args.no_wait:
-            return drive_to_end(robot, driver, lambda: request(driver))
-        granted(robot, request(driver))
-        return 0
+        try:
+            with handle_stop_signals(signal.default_int_handler):
+                granted(robot, request(driver))
+                if args.no_wait:
+                    return 0
+                for report in navigation.reports_of(robot, driver.asked_ns):
+                    if is_terminal:
+                        left = f", {report.left_m:.2f} m left" if math.isfinite(report.left_m) else ""
+                        HANDLER.show(f"{report.words}{left}")
+                    elif report.words != shown and report.command_ns == driver.asked_ns:
+                        print(report.words, flush=True)
+                    shown = report.words
+        except KeyboardInterrupt:
+            words = granted(robot, driver.navigate("cancel"))  # before a word is printed: the terminal may be gone
+            HANDLER.show("")
+            print(words)
+            return 1
+    HANDLER.show("")
+    if report.command_ns != driver.asked_ns:
+        print(f"not reached: {robot.name} follows another request now: {report.task}")
+        return 1
+    if is_terminal:
+        print(report.words)
+    return int(report.state != NavigationState.REACHED)

@@ -6,7 +6,7 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import IO, Final
 
@@ -21,48 +21,45 @@ from omnid.transport.session import Unreachable
 from omnid.transport.status_names import short_name
 
 SHOW_PERIOD_S: Final = 1.0
-CLEAR: Final = "\x1b[H\x1b[J"
 
 
 def listen(bus: BusConfig, seconds: float | None) -> int:
     """Show the robot until a signal or for a number of seconds. Return the exit code, 1 where no pose arrived."""
     state, signals, reason = RobotState(), list[int](), ""
+    robot: Robot | None = None
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     with handle_stop_signals(lambda number, _: signals.append(number)), ExitStack() as connection:
-        # 1. Try to connect until it succeeds, and print each new reason once.
-        robot: Robot | None = None
-        while robot is None and not signals and time.monotonic() < end_s:
-            try:
-                robot = connection.enter_context(Robot(settings=bus))
-            except Unreachable as error:
-                if str(error) != reason:
-                    print(f"omnid: waiting: {error}", file=sys.stderr, flush=True)
-                reason = str(error)
-                time.sleep(SHOW_PERIOD_S)
-        # 2. Process and show the messages.
-        if robot is not None:
-            robot.on_message(state.put, "odom")
-            robot.on_message(state.put, "status", kept=True)
-            robot.on_alive(state.set_alive)
-            state.robots_there = robot.robots_there
-        next_s = time.monotonic() + SHOW_PERIOD_S
-        while robot is not None and not signals and (now_s := time.monotonic()) < end_s:
-            state.next(min(next_s, end_s) - now_s)
+        while not signals and time.monotonic() < end_s:
+            # 1. Try to connect until it succeeds, and print each new reason once.
+            if robot is None:
+                try:
+                    robot = connection.enter_context(Robot(settings=bus))
+                except Unreachable as error:
+                    if str(error) != reason:
+                        print(f"omnid: waiting: {error}", file=sys.stderr, flush=True)
+                    reason = str(error)
+                    time.sleep(SHOW_PERIOD_S)
+                    continue
+                robot.on_message(state.put, "odom")
+                robot.on_message(state.put, "status", kept=True)
+                robot.on_alive(state.set_alive)
+                state.robots_there = robot.robots_there
+            # 2. Process messages for a period, and show the state.
+            next_s = min(end_s, time.monotonic() + SHOW_PERIOD_S)
+            while (left_s := next_s - time.monotonic()) > 0 and not signals:
+                state.next(left_s)
             state.forget_ended()
-            if time.monotonic() >= next_s:
-                print_state(robot.name, state)
-                next_s = max(next_s + SHOW_PERIOD_S, time.monotonic())
-    print_state(bus.robot, state)
+            print_state(robot.name, state)
     return int(state.poses == 0)
 
 
 def print_state(robot: str, state: RobotState, out: IO[str] | None = None) -> None:
-    """Write a table in place on a terminal, else one line."""
+    """Write a table in place on a terminal, as far as it fits, else one line."""
     out = out or sys.stdout
     if out.isatty():
         size = shutil.get_terminal_size()
-        lines = fitted(status_table(robot, state), size.columns, size.lines)
-        out.write(CLEAR + "\n".join(lines) + "\n")
+        lines = [line[: size.columns] for line in status_table(robot, state)]
+        out.write("\x1b[H\x1b[J" + "\n".join(lines[: size.lines - 1]) + "\n")
     else:
         out.write("  ".join(line.strip() for line in pose_lines(robot, state)) + "\n")
     out.flush()
@@ -82,12 +79,11 @@ def pose_lines(robot: str, state: RobotState) -> Iterator[str]:
         f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
         f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
     )
-    # Ages and network latencies, median and 99th percentile; the pace of a simulation.
+    # The pace of a simulation, and ages of poses, median and 99th percentile.
     pace = [f"{plain(state.real_time_factor)} x real time"] if state.real_time_factor else []
-    named = (("age", state.age), ("network", state.network))
-    times = [f"{name} {1e3 * t_s.p(0.5):.1f}/{1e3 * t_s.p(0.99):.1f} ms" for name, t_s in named if t_s.count]
+    age = [f"age {1e3 * state.age.p(0.5):.1f}/{1e3 * state.age.p(0.99):.1f} ms"] if state.age.count else []
     losses = f"missed {state.missed}  unreadable {state.broken}  not shown here {state.dropped}"
-    yield "  " + "  ".join([*pace, *times, losses])
+    yield "  " + "  ".join([*pace, *age, losses])
 
 
 def status_table(robot: str, state: RobotState) -> Iterator[str]:
@@ -101,12 +97,3 @@ def status_table(robot: str, state: RobotState) -> Iterator[str]:
         yield plain(
             f"  {LEVELS[status.level % len(LEVELS)]:7s} {short_name(status.name):16s} {status.message}  {values}"
         )
-
-
-def fitted(lines: Iterable[str], columns: int, rows: int) -> list[str]:
-    """Return the lines cut to the columns and rows of a terminal; its last row is for the cursor."""
-    cut = [line if len(line) <= columns else f"{line[: max(0, columns - 1)]}\N{HORIZONTAL ELLIPSIS}" for line in lines]
-    if len(cut) < rows:
-        return cut
-    shown = max(1, rows - 2)
-    return [*cut[:shown], f"  ... {len(cut) - shown} more; make the window higher"[:columns]]

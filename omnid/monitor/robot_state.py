@@ -50,7 +50,6 @@ class RobotState:
         self.robots_there = ""  # robots found at the time of connecting, as a part of a sentence
         self.poses = self.missed = self.broken = 0
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
-        self.network = Histogram()  # s, from the robot's network to the arrival of a pose
         self.recent: deque[Pose] = deque(maxlen=_RECENT)  # newest poses of the run: what is seen from one comes later
         self._arrivals_s: deque[float] = deque(maxlen=_RECENT)
 
@@ -117,10 +116,9 @@ class RobotState:
         self.pose = pose
         self.poses += 1
         self._arrivals_s.append(arrival_s)
-        of_robot = [] if self.real_time_factor else [(self.age, pose.stamp_ns)]
-        for histogram, since_ns in (*of_robot, (self.network, pose.attachment.sent_ns)):
-            if 0 <= pose.received_ns - since_ns < OTHER_CLOCK_NS:
-                histogram.add((pose.received_ns - since_ns) * 1e-9)
+        age_ns = pose.received_ns - pose.stamp_ns
+        if not self.real_time_factor and 0 <= age_ns < OTHER_CLOCK_NS:
+            self.age.add(age_ns * S_PER_NS)
         return pose
 
     @property
