@@ -22,7 +22,7 @@ from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
-from tests.replay.edited import Image, Pixels, dark, images, repeat_lines, roll, save, shift, tear, turn
+from tests.replay.edited import Image, Pixels, dark, images, repeat_lines, save, shift, tear, turn
 
 DARK_PAIRS = 20  # pairs, 2 s
 
@@ -153,10 +153,6 @@ CASES: Final = {
         ("lower",),
         lambda taken: turn(taken, 1.0, since=SINCE),
         r"the lower camera were displaced by .* turned by -(0\.9|1\.0)",
-    ),
-    # The first image is not rolled, and left out.
-    "lines of both read one after another": Case(
-        BOTH, roll, r"cameras have rows that .* line time about -[345]\d\d us .* set", since=0
     ),
 }
 
