@@ -8,7 +8,8 @@ sigmas.
 
 The landmarks that the map knows nearby have been seen from several places, which show their depth. A new one whose
 disparity is not theirs, and whose patch matches as well at theirs, is left out; where it matches at its own only it is
-another surface. In the first keyframe there are none: see first_depths.py.
+another surface. In the first keyframe there are none: where nearly all landmarks match at several disparities, only
+the others make the map, and all that come later are compared with these.
 """
 
 from __future__ import annotations
@@ -33,8 +34,7 @@ SIDE_PX = KltSettings().window_px  # side of a patch
 # By how much the correlation of the patch at its own disparity exceeds that at another one where it does not repeat,
 # because identical bricks differ by less than 0.05, other textures by 0.3 and more.
 LEAST_LEAD = 0.15
-MOST_ALIKE = 10  # disparities of one landmark, because courses of 6 cm fit into a baseline of 0.5 m less often
-APART_PX = 3.0  # least distance of two of them, more than the width of a peak
+APART_PX = 3.0  # least distance of two disparities, more than the width of a peak
 
 
 def normalised_patches(
@@ -82,27 +82,17 @@ def has_wrong_period(pair: Pair, pixels: Array, rows: Array, known: Array) -> Fl
     return found
 
 
-def matching_disparities(pair: Pair, views: Array, most_px: int) -> Array:
-    """Return disparities (N, K) [px] up to most_px at which views (N, 3) [px] match: their own first, then the best.
-
-    The others are peaks of the correlation within LEAST_LEAD of the own one; NaN: there are no more.
-    """
-    own, found = views[:, 2] - views[:, 1], np.full((len(views), MOST_ALIKE), np.nan)
-    lower, _ = normalised_patches(pair[0], np.rint(views[:, :2]), SIDE_PX)
+def repeats(pair: Pair, pixels: Array, rows: Array, most_px: int) -> Flags:
+    """Return flags of pixels (N, 2) with upper rows (N,) that match as well at another disparity, up to most_px."""
+    lower, _ = normalised_patches(pair[0], np.rint(pixels), SIDE_PX)
+    own = np.rint(rows - pixels[:, 1])
     # 1. The correlation at all disparities; -1 where the panorama ends.
-    scores = np.full((len(views), most_px + 1), -1.0, np.float32)
+    scores = np.full((len(pixels), most_px + 1), -1.0, np.float32)
     for disparity in range(most_px + 1):
-        there = np.rint(views[:, :2] + [0.0, disparity])
-        inside = np.flatnonzero(there[:, 1] < len(pair[1].image))
-        scores[inside, disparity] = (lower[inside] * normalised_patches(pair[1], there[inside], SIDE_PX)[0]).sum(axis=1)
-    # 2. Its peaks, to fractions of a pixel by a parabola, away from the own disparity.
-    before, peak, after = scores[:, :-2], scores[:, 1:-1], scores[:, 2:]
-    at = np.arange(1, most_px) + (before - after) / np.minimum(2 * (before - 2 * peak + after), -1e-6)
-    nearest = np.clip(np.rint(own)[:, None].astype(np.intp) + np.arange(-1, 2), 0, most_px)
-    at_own = np.take_along_axis(scores, nearest, axis=1).max(axis=1, keepdims=True)
-    is_peak = (peak >= before) & (peak > after) & (peak > at_own - LEAST_LEAD)
-    ranked = np.where(is_peak & (np.abs(at - own[:, None]) > APART_PX), peak, -np.inf)
-    order = np.argsort(-ranked, axis=1, kind="stable")[:, : MOST_ALIKE - 1]
-    kept = np.isfinite(np.take_along_axis(ranked, order, axis=1))
-    found[:, 0], found[:, 1 : 1 + order.shape[1]] = own, np.where(kept, np.take_along_axis(at, order, axis=1), np.nan)
-    return found
+        there = np.rint(pixels + np.array([0.0, disparity]))
+        upper, _ = normalised_patches(pair[1], there, SIDE_PX)
+        scores[:, disparity] = np.where(there[:, 1] < len(pair[1].image), (lower * upper).sum(axis=1), -1.0)
+    # 2. The best one near the own disparity, and the best one elsewhere.
+    is_own = np.abs(np.arange(most_px + 1) - own[:, None]) <= APART_PX
+    at_own = np.where(is_own, scores, -1.0).max(axis=1)
+    return np.asarray(np.where(is_own, -1.0, scores).max(axis=1) > at_own - LEAST_LEAD)

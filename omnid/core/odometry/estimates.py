@@ -82,7 +82,6 @@ class PoseEstimate:
     # Mean cost of a landmark in view: half of the Cauchy kernel's value, by the landmarks that count as one.
     cost: float = 0.0
     in_view: int = 0  # landmarks by which it is meant
-    doubtful_depths: bool = False  # True while the landmarks may all have another depth: it is in the covariance
     upper_ratio: float = 1.0  # share of the inliers among the tracks that the upper panorama shows where they must be
 
     def distance_m(self, T_odom_rect: Array) -> float:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, RigVelocity
-from omnid.core.odometry.first_depths import FirstDepths
 from omnid.core.odometry.plane_patches import REACH_PX, AlignedPatches, align, moved_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import MIN_RADIUS2_M2, point_covariance, triangulate, view
@@ -111,7 +110,6 @@ class LocalMap:
         """Remove all landmarks and keyframes."""
         self.keyframes: dict[int, Keyframe] = {}
         self._set_rows(np.zeros(0, LANDMARK))
-        self.first_depths: FirstDepths | None = None  # of the only keyframe; None: its depths are not in doubt
         self.last: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         # What waits for the velocity at its frame: an estimate with the ids of its landmarks, and new landmarks.
         self._seen: tuple[Indices, PoseEstimate] | None = None
@@ -268,13 +266,6 @@ class LocalMap:
         self._set_rows(self._rows[kept])
         anchors = set(self.table.anchor.tolist())
         self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
-
-    def decide_first_depths(self, lower: PaddedPanorama, step_m: tuple[float, float]) -> None:
-        """Let a new panorama decide among the depths of the first keyframe; step_m: see FirstDepths.decide."""
-        if self.first_depths is not None:
-            self.first_depths.decide(lower, self._coarse_klt, self, step_m)
-            if not self.first_depths.is_open:
-                self.first_depths = None
 
     def track(
         self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0, near: bool = False

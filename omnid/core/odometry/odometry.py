@@ -194,11 +194,8 @@ class VisualOdometry:
 
     def _find(self, now: _Prediction) -> list[PoseEstimate]:
         """Return the pose of a frame in the map, and those of other motions; none: no landmarks were found."""
-        sensed_m = math.nan
         if now.is_measured:
             self._hypotheses.agree()
-            sensed_m = float(np.linalg.norm(now.T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
-        self._map.decide_first_depths(now.frame.lower, (self._limits.max_speed_mps * now.dt_s, sensed_m))
         found = self._search.find(now.frame, now.usable, self._T_odom_rect, now.T_odom_rect, now.exposure)
         # After a refused frame the displacements from an unknown place lead anywhere: relocalisation decides.
         if found is None or self._tracking.is_refused:
@@ -260,7 +257,7 @@ class VisualOdometry:
     def _accept(self, now: _Prediction, estimate: PoseEstimate, *, is_reset: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""
         limits, at_previous = self._limits, None
-        is_sure = self._hypotheses.is_single and not estimate.doubtful_depths and self._is_well_supported(estimate)
+        is_sure = self._hypotheses.is_single and self._is_well_supported(estimate)
         if not self._tracking.is_refused and 0 < now.dt_s <= limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             at_previous = self._motion.accept(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import SAME_M, OdometryLimits, PoseEstimate
+from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.motion_hypotheses import displacements
@@ -209,12 +209,9 @@ class PoseSearch:
         solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
         if solution is None:
             return None
-        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it. It covers other
-        #    depths of the first keyframe (first_depths.py), with which a pose may also err to the side.
+        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it.
         T_odom_rect = se3.inverse(solution.T)
         scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
-        first = self._map.first_depths
-        doubt_m = 0.0 if first is None else first.doubt_m(T_odom_rect)
         variance = variance[landmarks]
         # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
         # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
@@ -230,7 +227,7 @@ class PoseSearch:
         )
         return PoseEstimate(
             T_odom_rect,
-            scale * solution.covariance + np.diag(np.repeat([doubt_m**2, 0.0], 3)),
+            scale * solution.covariance,
             visible,
             tracked,
             min(supporting, len(landmarks)),
@@ -242,7 +239,6 @@ class PoseSearch:
             assumed,
             _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
             in_view,
-            doubtful_depths=doubt_m > SAME_M,
             upper_ratio=_upper_ratio(frame, coarse),
         )
 
