@@ -319,7 +319,8 @@ def _weight(left: Array) -> Array:
 
 def _robust(A: Array, y: Array, weight: Array) -> Array:
     """Return x (K,) that minimises the Geman-McClure cost of y - A x, A (N, 2, K), from weights (N,)."""
-    x, size = np.zeros(A.shape[2]), A.shape[2]
+    size = A.shape[2]
+    x: Array = np.zeros(size)
     for _ in range(ROUNDS):
         weighted = (weight[:, None, None] * A).reshape(-1, size)
         x = np.linalg.solve(weighted.T @ A.reshape(-1, size) + RIDGE * np.eye(size), weighted.T @ y.ravel())
