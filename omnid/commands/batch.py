@@ -171,14 +171,12 @@ def _below(path: Path) -> Iterator[Path]:
 
 
 def _stored(job: Job) -> dict[str, Any] | None:
-    """Return the result of an earlier run of the same job, None without one. Raise OmnidError for another log's."""
+    """Return the result of an earlier run of the same job, None without one."""
     try:
         result: dict[str, Any] = json.loads((job.folder / RESULT_FILE).read_text())
-        log, is_done = result["log"], result["seen"] == job.seen and result["status"] in DONE.values()
+        is_done = result["seen"] == job.seen and result["status"] in DONE.values()
     except (OSError, ValueError, TypeError, KeyError):
         return None
-    if log != str(job.log):
-        raise OmnidError(f"batch: {str(job.folder)!r} has the results of {log!r}: give another --out")
     return result if is_done else None
 
 

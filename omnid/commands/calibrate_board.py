@@ -176,7 +176,7 @@ def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
     """Take the pairs that are in the folder, which is made if it is missing; return the highest number of an image."""
     if folder is None:
         return 0
-    options.make_folder("calibrate live: DIR", folder)
+    folder.mkdir(parents=True, exist_ok=True)
     lower, upper = ({path.stem.removeprefix(f"{side}_") for path in folder.glob(f"{side}_*")} for side in SIDES)
     if lower & upper:  # half a pair is left where it was killed between two files
         pairs = read_pairs(folder)

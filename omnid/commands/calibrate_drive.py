@@ -42,19 +42,33 @@ def run(args: argparse.Namespace) -> int:
       calibrate drive drive.mcap --only check
       calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml
     """
-    _check(args)
-    start = _start(args)
+    # 1. The rig to start from.
+    if args.output is not None:
+        check_outputs([("--output", args.output)], [("the log that is read", log) for log in args.logs])
+    if args.rig is not None:
+        start = read_rig(args.rig)
+    else:
+        with closing(open_log(args.logs[0], log_cameras(args), None)) as reader:
+            start = attached_rig(reader, args.logs[0])
     prepare_kernels()
-    # 1. Check the rig, or adjust all of it.
+    # 2. Check the rig, or adjust all of it.
     rig, has_drifted = start, False
     if not args.only:
         rig = _adjusted(args, rig)
     elif "check" in args.only:
         rig, has_drifted = _checked(args, rig)
-    # 2. Find the height, and the masks.
+    # 3. Find the height, and the masks; a log that shows none of them is no error but for --only.
     rig, contradiction = _at_height(args, rig)
-    rig = _masked(args, rig)
-    # 3. Write the rig.
+    if not args.only or "mask" in args.only:
+        try:
+            mask = calibrate_mask(args.logs[0], rig, log_cameras(args))
+            print(mask)
+            rig = mask.rig if mask.share or args.only else rig
+        except OmnidError as error:
+            if args.only:
+                raise
+            print(error)
+    # 4. Write the rig.
     if contradiction:
         return failed(f"{contradiction}; nothing was written")
     if args.output is not None and rig is start:
@@ -64,19 +78,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.output}: written, {height_of(rig)}")
     is_found = rig is not start or bool(args.only)
     return 0 if is_found and not has_drifted else 1
-
-
-def _check(args: argparse.Namespace) -> None:
-    if args.output is not None:
-        check_outputs([("--output", args.output)], [("the log that is read", log) for log in args.logs])
-
-
-def _start(args: argparse.Namespace) -> Rig:
-    """Return the rig to start from: that of --rig, else the one attached to the first log."""
-    if args.rig is not None:
-        return read_rig(args.rig)
-    with closing(open_log(args.logs[0], log_cameras(args), None)) as reader:
-        return attached_rig(reader, args.logs[0])
 
 
 def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
@@ -126,18 +127,3 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
             return rig, contradiction
         print(f"{args.ruler_m:.3f} m by ruler agrees")
     return found.rig, ""
-
-
-def _masked(args: argparse.Namespace, rig: Rig) -> Rig:
-    """Return the rig whose masks hide what is fixed to its cameras. A log without a turn is no error but for --only."""
-    if args.only and "mask" not in args.only:
-        return rig
-    try:
-        found = calibrate_mask(args.logs[0], rig, log_cameras(args))
-    except OmnidError as error:
-        if args.only:
-            raise
-        print(error)
-        return rig
-    print(found)
-    return found.rig if found.share or args.only else rig

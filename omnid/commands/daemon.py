@@ -21,8 +21,8 @@ from calib.se2_arrays import transform
 from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
 from drivers.frame import Camera
 from drivers.logs.log_reader import LogReader
-from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, make_folder, settings_of
-from omnid.commands.replay import Output, replay_and_print
+from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, settings_of
+from omnid.commands.replay import replay_and_print
 from omnid.config import Config, unused_settings
 from omnid.controller.motor import SIMULATED
 from omnid.engine.kernel_cache import prepare_kernels
@@ -163,7 +163,7 @@ def demo(args: argparse.Namespace) -> int:
       demo --drive
       demo --output /tmp/demo --quiet
     """
-    make_folder("--output", args.output)
+    args.output.mkdir(parents=True, exist_ok=True)
     if args.drive:
         return _drive(args)
     tum = args.output / "trajectory.tum"
@@ -180,7 +180,7 @@ def demo(args: argparse.Namespace) -> int:
     config = settings_of(args)
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
-        code = replay_and_print(log, config, options, Output(args.quiet, args.verbose))
+        code = replay_and_print(log, config, options, args)
         if code == 0:
             print(f"\nagainst the truth:\n{evaluate(read_tum(tum), read_tum(truth))}")
     return code

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -14,12 +14,13 @@ from calib.atomic_file import write_file
 from calib.rig_file import png
 from drivers.cameras.v4l2_camera import V4l2Camera
 from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
+from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.frame import CAMERAS as SIDES
-from drivers.frame import Camera, Frame, gray
-from drivers.logs.log_reader import LogReader
+from drivers.frame import Camera, gray
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.calibration import snapshot
-from omnid.commands.options import CAMERAS, SETTINGS, command, failed, make_folder, settings_of
+from omnid.calibration.images import Image
+from omnid.commands.options import SETTINGS, command, failed, settings_of
 from omnid.commands.tools import require_packages
 from omnid.config import Config
 from omnid.doctor import checks
@@ -69,7 +70,7 @@ To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are pl
 """
 
 
-@command(CAMERAS, SETTINGS)
+@command(SETTINGS)
 def show_cameras(args: argparse.Namespace) -> int:
     """List cameras and the udev rule to copy.
 
@@ -77,19 +78,13 @@ def show_cameras(args: argparse.Namespace) -> int:
     which is highest where the lens is set best. Exit code 1: there is no camera.
 
     --snapshot DIR  write DIR/lower.png and DIR/upper.png
-    --log LOG       of --snapshot: take the images of a log, of which --lower and --upper are topics
 
     examples:
       cameras
       cameras --snapshot views --config /etc/omnid/omnid.toml
-      cameras --snapshot views --log drive.mcap
     """
     if args.snapshot is not None:
         return _snapshot(args)
-    if args.log is not None:
-        raise OmnidError(
-            f"--log {args.log} is for images: add --snapshot DIR; `omnid log info {args.log}` shows its content"
-        )
     devices = capture_devices(ROOT)
     if not devices:
         return failed("no cameras: the kernel has no capture device; check the cables and the output of `dmesg`")
@@ -105,10 +100,10 @@ def show_cameras(args: argparse.Namespace) -> int:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    make_folder("--snapshot", args.snapshot)
+    config = settings_of(args)
+    args.snapshot.mkdir(parents=True, exist_ok=True)
     for camera in SIDES:
-        with closing(_frames(args, camera)) as frames:
-            found = [gray(frame) for frame in islice(frames, snapshot.IMAGES)]
+        found = _images(config.cameras.settings(camera), camera)
         if not found:
             raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
         view = snapshot.view_of(found)
@@ -118,21 +113,15 @@ def _snapshot(args: argparse.Namespace) -> int:
     return 0
 
 
-def _frames(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
-    """Yield a camera's frames of a log, or of the device once its exposure has adapted, until it gives none in time."""
-    config = settings_of(args)
-    if args.log is not None:
-        bits, rate_hz = config.cameras.bits, config.log.rate_hz
-        with closing(LogReader(args.log, args.lower, args.upper, bits=bits, rate_hz=rate_hz)) as reader:
-            yield from (frame for frame in reader.frames() if frame.camera == camera)
-        return
+def _images(settings: V4l2Settings, camera: Camera) -> list[Image]:
+    """Return images of a camera once its exposure has adapted; fewer where it gives none in time."""
 
     def end_when_lost(_: int, __: str) -> None:
         if source.state.status == "lost":
             source.close()
 
-    with closing(V4l2Camera(config.cameras.settings(camera), camera, on_event=end_when_lost)) as source:
-        yield from islice(source.frames(), SETTLE, None)
+    with closing(V4l2Camera(settings, camera, on_event=end_when_lost)) as source:
+        return [gray(frame) for frame in islice(source.frames(), SETTLE, SETTLE + snapshot.IMAGES)]
 
 
 @command(SETTINGS)

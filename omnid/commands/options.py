@@ -36,8 +36,6 @@ from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
 
 import msgspec
 
-from omnid.errors import OmnidError
-
 if TYPE_CHECKING:  # the help and other commands do not load these
     from calib.rig import Rig
     from drivers.cameras.v4l2_camera import V4l2Camera
@@ -247,16 +245,6 @@ def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:
 
     config.cameras.require_two_devices()
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
-
-
-def make_folder(option: str, folder: Path) -> None:
-    """Make a folder and those above it where they are missing. Raise OmnidError where that cannot be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OmnidError(
-            f"{option} {folder}: cannot be made ({error.strerror}); name a folder that can be made"
-        ) from error
 
 
 def warn(line: str) -> None:

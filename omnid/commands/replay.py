@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from omnid.commands.options import (
     CAMERAS,
@@ -27,7 +27,6 @@ from omnid.config import Config, unused_settings
 from omnid.diagnostics.run_summary import Progress, run_summary, summary_line
 from omnid.errors import OmnidError
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.runs.run_result import RunResult
 from omnid.sinks.files import on_stdout
 
 
@@ -87,55 +86,35 @@ def run(args: argparse.Namespace) -> int:
         drops=args.realtime,
         settings=args.config,
     )
-    output = Output(args.quiet, args.verbose, args.json)
     if args.rerun is None:
-        return replay_and_print(args.log, config, options, output)
+        return replay_and_print(args.log, config, options, args)
     if args.record is not None:
         raise OmnidError("--rerun and --record exclude each other: replay the log once for each")
-    from omnid.commands.view import draw_replay, sink_of
+    from omnid.commands.view import sink_of  # rerun may be missing
 
-    return draw_replay(sink_of(args.rerun, args.log), args.log, config, options, output)
+    with closing(sink_of(args.rerun, args.log)) as sink:
+        from omnid.viewer.rerun_sink import ReplayDrawing
 
-
-class Output(NamedTuple):
-    """The parts of a run that are printed."""
-
-    quiet: bool = False  # no progress
-    verbose: bool = False  # all counters, and the times of the stages
-    as_json: bool = False
+        drawn = replace(options, map_every_s=config.live.cloud_s, observer=lambda it, _: ReplayDrawing(sink, it))
+        return replay_and_print(args.log, config, drawn, args)
 
 
-def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
-    """Replay a log, print its warnings and its summary, and return the exit code."""
-    result = run_log(log, config, options if output.quiet else replace(options, progress=Progress()))
-    _print_result(result, options, output)
-    return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))
+def replay_and_print(log: Path, config: Config, options: ReplayOptions, args: argparse.Namespace) -> int:
+    """Replay a log, print warnings on stderr and the summary on stdout, and return the exit code.
 
-
-def _print_result(result: RunResult, options: ReplayOptions, output: Output) -> None:
-    """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout."""
+    Where a file goes to stdout, the summary goes to stderr. args: --quiet, --verbose, and perhaps --json.
+    """
+    result = run_log(log, config, options if args.quiet else replace(options, progress=Progress()))
     for warning in result.warnings:
         warn(warning)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
-    if output.as_json:
-        print_json(
-            {
-                "counters": result.counters,
-                "timings": {stage: row._asdict() for stage, row in result.timings.items()},
-                "warnings": result.warnings,
-                "signal": result.signal,
-                "elapsed_s": result.elapsed_s,
-            },
-            stream,
-        )
-        return
-    print(run_summary(result.counters, result.timings.values(), verbose=output.verbose), file=stream)
-    speed = f"{result.counters.pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
-    files = [path for _, path in options.files] + ([result.map_file] if result.map_file else [])
-    entries = {
-        "speed": speed,
-        "written": ", ".join(map(str, files)),
-    }
-    for name, words in entries.items():
-        if words:
-            print(summary_line(name, words), file=stream)
+    if getattr(args, "json", False):
+        found = {name: getattr(result, name) for name in ("counters", "warnings", "signal", "elapsed_s")}
+        print_json(found | {"timings": {stage: row._asdict() for stage, row in result.timings.items()}}, stream)
+    else:
+        print(run_summary(result.counters, result.timings.values(), verbose=args.verbose), file=stream)
+        speed = f"{result.counters.pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
+        print(summary_line("speed", speed), file=stream)
+        if files := [path for _, path in options.files] + ([result.map_file] if result.map_file else []):
+            print(summary_line("written", ", ".join(map(str, files))), file=stream)
+    return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))

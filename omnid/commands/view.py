@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,6 @@ from drivers.errors import FrameDecodeError
 from drivers.logs.open_log import log_info
 from omnid.client import Robot
 from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, command, settings_of, warn
-from omnid.commands.replay import Output, replay_and_print
 from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
@@ -29,13 +27,11 @@ from omnid.plain_text import plain
 from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader, choose_odometry_topic, no_pose
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
-from omnid.runs.replay import ReplayOptions
 from omnid.sinks.files import check_outputs, on_stdout
-from omnid.stages.front_end import FrontEnd
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 if TYPE_CHECKING:  # it imports rerun, which may be missing
-    from omnid.viewer.rerun_sink import ReplayDrawing, RerunSink
+    from omnid.viewer.rerun_sink import RerunSink
 
 
 @command(ROBOT, SECONDS, SETTINGS)
@@ -128,21 +124,6 @@ def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | 
         warn(f"{log}: {unreadable} messages or pieces cannot be read")
     if not sink.poses:
         raise no_pose(log, reader.topic)
-
-
-def draw_replay(sink: RerunSink, log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
-    """Replay a log, print its summary, and draw what its stages compute. Return the exit code."""
-    from omnid.viewer.rerun_sink import ReplayDrawing
-
-    def observer(front_end: FrontEnd, _: object) -> ReplayDrawing:
-        return ReplayDrawing(sink, front_end)
-
-    try:
-        return replay_and_print(
-            log, config, replace(options, map_every_s=config.live.cloud_s, observer=observer), output
-        )
-    finally:
-        sink.close()
 
 
 def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
