@@ -248,7 +248,7 @@ class NavigationUpdate:
     loops_left: int = 0  # rounds of a route that are left, this one included
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0  # its length so far
-    taught: TaughtRoute | None = None  # route that is to be written; the same object until that is done
+    taught: TaughtRoute | None = None  # the newest route that is to be written; the same object until the next one
     answers: tuple[RequestAnswer, ...] = ()  # answers to the newest requests, the newest one last
     plan: NavigationPlan | None = None  # None where the plan is that of the message before
 

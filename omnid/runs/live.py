@@ -267,7 +267,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         if PLANNER in config.controller.sources.names:
             planner, folder = PlannerDrive(controller, bus.answer), RouteFolder(Path(config.navigation.routes))
-            navigation = Navigation(requests, states, folder, planner, config.places.map)
+            navigation = Navigation(requests, states, folder, planner, bus.answer, config.places.map)
         else:
             warn(NO_PLANNER)
     inputs = Inputs(frames, run_places, controller, navigation, map_is_read, config.live.cloud_s)

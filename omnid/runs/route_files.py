@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, RouteAction, RouteRequest, TaughtRoute, stops_motion
-from omnid.engine.graph import Graph
+from omnid.engine.graph import Graph, Stream
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import NavigationUpdate
-from omnid.stages.routes import refusal_of_name
-from omnid.transport.topics import MOST_OPEN
+from omnid.messages import NavigationUpdate, SaveMap
+from omnid.transport.topics import MOST_OPEN, Answer
 
 LONGEST_WAIT_S: Final = 5.0  # A robot that sets out later than this after the request surprises people.
 
@@ -29,12 +29,12 @@ class Requests:
 
     def put(self, command: NavigationCommand) -> None:
         """Add a request."""
-        is_of_route = isinstance(command.request, RouteRequest | TaughtRoute) and not stops_motion(command.request)
+        is_of_route = isinstance(command.request, RouteRequest) and not stops_motion(command.request)
         (self.of_routes if is_of_route else self.direct).push(command)
 
 
 class RouteFiles:
-    """A stage that reads the route of a request to repeat it, and writes one that was taught."""
+    """A stage that reads the route of a request to repeat it."""
 
     def __init__(self, folder: RouteFolder) -> None:
         self._folder = folder
@@ -43,12 +43,11 @@ class RouteFiles:
         """Return a request with what the navigation has to know of its file."""
         request, name = command.request, getattr(command.request, "name", "")
         try:
-            if isinstance(request, TaughtRoute):
-                self._folder.write(request.route)
-            elif isinstance(request, RouteRequest) and request.action is RouteAction.REPEAT:
+            if isinstance(request, RouteRequest) and request.action is RouteAction.REPEAT:
                 command = command._replace(request=replace(request, route=self._folder.read(name)))
             elif request == RouteRequest(RouteAction.TEACH, name) and self._folder.has(name):
-                return command._replace(refusal=refusal_of_name(name))
+                again = f"choose another name, or replace it (`omnid route teach {name} --replace`)"
+                return command._replace(refusal=f"there is a route {name} already: {again}")
         except OmnidError as error:
             return command._replace(refusal=str(error))
         if command.asked_ns and time.monotonic_ns() - command.asked_ns > LONGEST_WAIT_S * NS_PER_S:
@@ -57,15 +56,26 @@ class RouteFiles:
 
 
 class TaughtRoutes:
-    """A sink of the navigation that asks for a route that was taught to be written, once."""
+    """A sink of the navigation that writes a route that was taught, has its map saved, and answers the request."""
 
-    def __init__(self, requests: Requests) -> None:
-        self._requests = requests
-        self._asked: TaughtRoute | None = None
+    def __init__(
+        self, folder: RouteFolder, to_save: Stream[SaveMap] | None, answer: Callable[[int, Answer], object]
+    ) -> None:
+        """to_save: takes requests to save the map; None: it is not saved. answer: takes the id of the request."""
+        self._folder, self._to_save, self._answer = folder, to_save, answer
+        self._written: TaughtRoute | None = None
 
     def process(self, update: NavigationUpdate) -> None:
-        """Take the route that is to be written, if there is one."""
+        """Write the route of an update, if it is a new one."""
         taught = update.taught
-        if taught is not None and taught is not self._asked:
-            self._asked = taught
-            self._requests.put(NavigationCommand(taught, taught.route.created_s * NS_PER_S, id=taught.id))
+        if taught is None or taught is self._written:
+            return
+        self._written = taught
+        try:
+            self._folder.write(taught.route)
+        except OmnidError as error:
+            self._answer(taught.id, Answer(False, f"{error}; finish it again once that is mended"))
+            return
+        if self._to_save is not None:
+            self._to_save.push(SaveMap(taught.id))
+        self._answer(taught.id, Answer(True, "the route is written"))

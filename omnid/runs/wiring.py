@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from omnid.stages.mapping import MapGrid, Mapping
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
-from omnid.stages.routes import Routes
+from omnid.transport.topics import Answer
 
 BUS, FILES, BACKGROUND = "bus", "files", "background"  # threads that several stages and sinks share
 RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
@@ -39,6 +39,7 @@ class Navigation(NamedTuple):
     states: Stream[ControllerState]  # of the controller; an inlet of the thread that gives the commands
     routes: RouteFolder
     drive: Output[NavigationUpdate]
+    answer: Callable[[int, Answer], object]  # takes the id of a request whose route was written
     map_name: str  # of the file of the map; empty: it is not saved
 
 
@@ -118,7 +119,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         localize_only, copy_s = (False, 0.0) if run_map is None else (run_map.localize_only, run_map.copy_s)
         places = Places(geometry, config, front_end.dense, known_places, localize_only=localize_only, copy_s=copy_s)
         to_save = None if run_map is None else run_map.requests
-        asked: list[Stream[Any]] = [stream for stream in (written, to_save) if stream is not None]
+        asked: list[Stream[Any]] = [] if to_save is None else [to_save]
         in_map = graph.stage("places", places, poses, *asked)
         if run_map is not None and to_save is not None:
             graph.sink("save", run_map, in_map, thread=FILES)
@@ -131,10 +132,10 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
 
     # 4. All of them, and requests, give the way to drive.
     if navigation is not None:
-        requests, states, _, drive, map_name = navigation
+        requests, states, _, drive, _, map_name = navigation
         is_new = known_places is None or not known_places.keyframes
-        taught = Routes(map_name if places else "", T_base_rect, is_new=is_new)
-        stage = NavigationStage(config.navigation, config.controller.collision, T_base_rig, taught)
+        of_base, of_map = (config.controller.collision, T_base_rig, T_base_rect), map_name if places else ""
+        stage = NavigationStage(config.navigation, *of_base, of_map, is_new=is_new)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
         given = poses, in_map, scans, wheels, requests.direct, written
         seen: list[Stream[Any]] = [stream for stream in given if stream is not None]
@@ -175,7 +176,8 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         if stream is not None and outputs.bus is not None:
             graph.sink(name, outputs.bus, stream, policy=NEWEST, thread=thread)
     if navigation is not None and ways is not None:
-        graph.sink("taught", TaughtRoutes(navigation.requests), ways, thread=ways.thread)
+        to_save = None if run_map is None else run_map.requests
+        graph.sink("taught", TaughtRoutes(navigation.routes, to_save, navigation.answer), ways, thread=FILES)
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
     graph.sink("keyframes", lambda _: front_end.odometry.complete(), poses, thread=poses.thread)

@@ -202,7 +202,7 @@ def simulate(
     # 3. The run.
     run_places = RunPlaces(config, front_end.geometry, nothing)
     routes = RouteFolder(Path(config.navigation.routes))
-    navigation = Navigation(requests, states, routes, take_navigation, config.places.map)
+    navigation = Navigation(requests, states, routes, take_navigation, nothing, config.places.map)
     inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=navigation)
     in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
     outputs = Outputs(poses={"poses": take_pose}, scans={"scans": take_scan}, places=in_map)

@@ -21,7 +21,6 @@ from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
     NavigationFrame,
-    NavigationRequest,
     NavigationVerb,
     PathRequest,
     RouteAction,
@@ -30,12 +29,21 @@ from omnid.core.navigation.requests import (
     may_begin_motion,
     stops_motion,
 )
+from omnid.core.navigation.route import KeyframePose, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
+from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_of_map, refusal_to_drive
 from omnid.core.navigation.surroundings import Surroundings, near_ends
 from omnid.errors import OmnidError
-from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate, RequestAnswer
-from omnid.stages.routes import Routes, refusal_while_teaching
+from omnid.messages import (
+    MapKeyframes,
+    NavigationPlan,
+    NavigationUpdate,
+    ObstacleScan,
+    OdometryUpdate,
+    PlaceUpdate,
+    RequestAnswer,
+)
+from omnid.tracking_state import MapState
 from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
@@ -48,26 +56,41 @@ FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 
 
 class NavigationStage:
-    """Drive to goals, along paths and routes. Its frames are those of the base, as on the bus."""
+    """Drive to goals, along paths and routes, and record routes. Its frames are those of the base, as on the bus.
+
+    Routes are tied to the keyframes of the map of places, as the newest update has them; others read and write files.
+    """
 
     def __init__(
         self,
         settings: NavigationSettings,
         collision: CollisionSettings,
         T_base_rig: Array,
-        routes: Routes,
+        T_base_rect: Array,
+        map_name: str,
+        *,
+        is_new: bool,
     ) -> None:
-        """collision: the outline of the base."""
-        self._settings, self._collision, self._T_base_rig, self._routes = settings, collision, T_base_rig, routes
+        """collision: the outline of the base. map_name: of the map's file; empty: the map is not saved, so no route can
+        be tied to it. is_new: the map was empty before this run, and its frame is odom at the start.
+        """
+        self._settings, self._collision, self._T_base_rig = settings, collision, T_base_rig
         self._T_rig_base = se3.inverse(T_base_rig)
+        self._T_base_rect, self._T_rect_base = T_base_rect, se3.inverse(T_base_rect)
+        self.map_name, self._is_new = map_name, is_new
         self._wheels = WheelState(False, False)
         self._navigator = Navigator(settings, collision)
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
+        self.keyframes = MapKeyframes({}, {})
         self._tie: tuple[int, Array] | None = None  # id of the newest keyframe, and its pose (3,) in the map
         self._reset_ns = -1  # stamp of the pose at which odometry began again
         self._scan: ObstacleScan | None = None
         self._around: Surroundings | None = None  # by the newest scan that was used
+        self._recorder: RouteRecorder | None = None  # of the route that is taught
+        self._finished: RouteRecorder | None = None  # of the last one, which is written again where that has failed
+        self._taught: TaughtRoute | None = None  # the last one
+        self._taught_resets = 0  # resets of odometry when the recording began
         self._seq = 0
         # Ids of the newest request to halt, and of that which began the newest drive: a request that waited for a file
         # may come after later ones.
@@ -83,17 +106,15 @@ class NavigationStage:
         match message:
             case OdometryUpdate():
                 return self._at_pose(message)
-            case PlaceUpdate():
-                self._place(message)
-                return None
-            case ObstacleScan():
-                self._scan = message
-                return None
-            case WheelState():
-                self._wheels = message
-                return None
             case NavigationCommand():
                 return self._request(message)
+            case PlaceUpdate():
+                self._place(message)
+            case ObstacleScan():
+                self._scan = message
+            case WheelState():
+                self._wheels = message
+        return None
 
     def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
         # 1. After a reset forget the pose in the map and what is about the base: they are of another odom.
@@ -114,11 +135,8 @@ class NavigationStage:
             self._in_map,
             self._surroundings(odometry.stamp_ns),
         )
-        # 3. Add the pose to a route that is being taught.
-        ended = self._routes.record(now, self._tie)
-        if ended:
-            self._answers.append(RequestAnswer(0, "teach", ended))
-        # 4. Steer.
+        # 3. Add the pose to a route that is being taught, and steer.
+        self._record(now)
         return self._update(self._navigator.step(now))
 
     def _surroundings(self, now_ns: int) -> Surroundings | None:
@@ -143,19 +161,17 @@ class NavigationStage:
         self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m, update.stamp_ns)
         T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
         self._tie = update.keyframe, planar(T_map_keyframe)
-        self._routes.keyframes = update.keyframes or self._routes.keyframes
+        self.keyframes = update.keyframes or self.keyframes
 
     def _request(self, command: NavigationCommand) -> NavigationUpdate:
-        """Execute a request; return the new state with the answer."""
-        taught = self._routes.taught
-        refusal = ""
+        """Execute a request; return the new state with the answer. Who writes a finished route answers for it."""
+        navigator, word, taught, refusal = self._navigator, _word(command), self._taught, ""
         try:
             self._execute(command)
         except OmnidError as error:
             refusal = str(error)
-        if self._routes.taught in (None, taught):  # else the answer comes when the route is written
-            self._answers.append(RequestAnswer(command.id, _word(command.request), refusal))
-        navigator = self._navigator
+        if self._taught is taught:
+            self._answers.append(RequestAnswer(command.id, word, refusal))
         setpoint = STAND if navigator.stopping else None
         update = self._update(Navigation(setpoint, navigator.state, navigator.reason), always=True)
         assert update is not None
@@ -164,11 +180,12 @@ class NavigationStage:
     def _execute(self, command: NavigationCommand) -> None:
         """Execute a request. Raise OmnidError with the reason to refuse it."""
         request, navigator = command.request, self._navigator
+        # 1. What overtakes it, as it has waited for a file, and a stop of the wheels since then.
         if stops_motion(request):
             self._halted = max(self._halted, command.id)
-        elif 0 < command.id < self._halted and not isinstance(request, TaughtRoute):
+        elif 0 < command.id < self._halted:
             raise OmnidError(OVERTAKEN)
-        elif not isinstance(request, RouteRequest | TaughtRoute):
+        else:
             _raise_if(command.refusal)
         if may_begin_motion(request):
             _raise_if(command.void)
@@ -176,6 +193,7 @@ class NavigationStage:
                 raise OmnidError("a stop or a fault has come since: ask again")
             if 0 < command.id < self._begun:
                 raise OmnidError(OVERTAKEN)
+        # 2. What it asks for.
         match request:
             case NavigationVerb.CANCEL:
                 navigator.cancel("by a request")
@@ -183,53 +201,34 @@ class NavigationStage:
                 navigator.pause(f"paused by a request: {RESUME}")
             case NavigationVerb.RESUME:
                 _raise_if(navigator.resume(self._situation()))
-            case GoalRequest():
-                self._start("goal", request.frame, [self._goal_path(request)], command)
-            case PathRequest():
-                self._start("path", request.frame, [self._given_path(request)], command)
-            case RouteRequest():
-                self._route(request, command)
-            case TaughtRoute():
-                self._routes.written(command.refusal)
-
-    def _route(self, request: RouteRequest, command: NavigationCommand) -> None:
-        routes = self._routes
-        match request.action:
-            case RouteAction.TEACH:
-                if self._navigator.task.startswith("route") and self._navigator.drive is not None:
-                    raise OmnidError("a route is being repeated: stop it first")
-                _raise_if(command.refusal)
-                routes.teach(request.name, self._situation(), replace=request.replace)
-            case RouteAction.FINISH:
-                routes.finish(command.arrival_ns // NS_PER_S, command.id)
-            case RouteAction.STOP:
-                if not routes.drop():
-                    self._navigator.cancel("stopped by a request")
-            case RouteAction.REPEAT:
-                if routes.teaching:
-                    raise OmnidError(refusal_while_teaching(routes.teaching))
-                # The route comes first, because a request for a missing one must not ask for arming.
-                route = routes.found(request, command.refusal)
-                self._require_ready(NavigationFrame.MAP)
-                paths = routes.paths(route, request, self._situation())
-                self._start(f"route {request.name}", NavigationFrame.MAP, paths, command)
+            case GoalRequest(frame):
+                self._start("goal", frame, [self._goal_path(request)], command)
+            case PathRequest(frame):
+                self._start("path", frame, [self._given_path(request)], command)
+            case RouteRequest(RouteAction.TEACH):
+                self._teach(request)
+            case RouteRequest(RouteAction.FINISH):
+                self._finish(command)
+            case RouteRequest(RouteAction.STOP):
+                if self._recorder is None:
+                    navigator.cancel("stopped by a request")
+                self._recorder = None
+            case RouteRequest(RouteAction.REPEAT):
+                self._start(f"route {request.name}", NavigationFrame.MAP, self._repeated(request), command)
 
     def _start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], command: NavigationCommand) -> None:
-        self._require_ready(frame)
         self._navigator.start(task, frame, paths, self._situation(), command.stamp_ns)
         self._begun = max(self._begun, command.id)
         xy = np.vstack([leg.xy for leg in paths[0].legs])
         self._plan = NavigationPlan(frame, xy, paths[0].final_heading_rad)
 
     def _goal_path(self, goal: GoalRequest) -> DrivePath:
-        self._require_ready(goal.frame)
-        pose = self._situation().pose_in(goal.frame)
+        pose = self._pose_in(goal.frame)
         self._require_near(math.dist(pose[:2], (goal.x_m, goal.y_m)))
         return goal_path(pose, (goal.x_m, goal.y_m), goal.heading_rad)
 
     def _given_path(self, path: PathRequest) -> DrivePath:
-        self._require_ready(path.frame)
-        pose = self._situation().pose_in(path.frame)
+        pose = self._pose_in(path.frame)
         away_m = math.dist(pose[:2], path.xy[0])
         self._require_near(away_m)
         if away_m > FIRST_LEG_M:
@@ -239,12 +238,91 @@ class NavigationStage:
             )
         return drive_path(np.vstack([pose[None, :2], path.xy]), path.heading_rad)
 
+    def _repeated(self, request: RouteRequest) -> list[DrivePath]:
+        """Return the paths of a repetition."""
+        self._require_map()
+        self._require_no_teaching()
+        if request.route is None:
+            raise OmnidError(f"the route {request.name} was not read")
+        if not request.route.fits(self._keyframe):
+            raise OmnidError(
+                f"the route {request.name} was taught in the map {request.route.map_name} as it was then: start with "
+                "that map (`omnid run --map`), or teach it again"
+            )
+        return repeated_paths(
+            request.route,
+            self._keyframe,
+            self._pose_in(NavigationFrame.MAP),
+            loops=request.loops,
+            reverse=request.reverse,
+            from_start=request.from_start,
+        )
+
+    def _teach(self, request: RouteRequest) -> None:
+        """Begin to record: where the robot is localised, or in a map that begins with this run."""
+        if self._navigator.task.startswith("route") and self._navigator.drive is not None:
+            raise OmnidError("a route is being repeated: stop it first")
+        self._require_map()
+        self._require_no_teaching()
+        now = self._situation()
+        refusal = refusal_of_map(now, math.inf)
+        if not (self._is_new and now.resets == 0 and now.in_map is not None):
+            _raise_if(refusal)
+        self._recorder, self._taught_resets = RouteRecorder(request.name), now.resets
+
+    def _record(self, now: Situation) -> None:
+        """Add the newest pose to the route that is being taught, where it is known in the map."""
+        recorder, tie, in_map = self._recorder, self._tie, now.in_map
+        if recorder is None or tie is None or in_map is None or in_map.state is MapState.LOST:
+            return
+        try:
+            if now.resets != self._taught_resets and in_map.state is not MapState.LOCALIZED:
+                raise OmnidError(
+                    f"odometry has begun again, so that the way of the route {recorder.name} is not known: teach it "
+                    "again"
+                )
+            recorder.add(now.pose_in(NavigationFrame.MAP), now.speed_mps, *tie)
+        except OmnidError as error:
+            self._recorder = None
+            self._answers.append(RequestAnswer(0, "teach", str(error)))
+
+    def _finish(self, command: NavigationCommand) -> None:
+        """Have the recorded route written; asked for again, the last one is written again, as a disk may be full."""
+        recorder = self._recorder or self._finished
+        if recorder is None:
+            raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
+        self._require_map()
+        created_s = command.arrival_ns // NS_PER_S
+        route = recorder.route(self._keyframe, self.keyframes.stamps_ns, created_s, self.map_name)
+        self._taught, self._finished, self._recorder = TaughtRoute(route, command.id), recorder, None
+
+    def _keyframe(self, id: int) -> KeyframePose | None:
+        """Return a keyframe of the map, None without one."""
+        T_map_rect = self.keyframes.T_map_rect.get(id)
+        if T_map_rect is None:
+            return None
+        return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rect @ T_map_rect @ self._T_rect_base))
+
+    def _require_map(self) -> None:
+        if not self.map_name:
+            raise OmnidError(
+                "routes need a map that is saved: start the robot (`omnid run`, `omnid simulate`) with --map FILE.omap"
+            )
+
+    def _require_no_teaching(self) -> None:
+        if self._recorder is not None:
+            raise OmnidError(
+                f"the route {self._recorder.name} is being taught: finish it, or drop it (`omnid route stop`)"
+            )
+
     def _require_near(self, away_m: float) -> None:
         if not away_m <= self._settings.reach_m:
             raise OmnidError(f"{away_m:.1f} m away: farther than navigation.reach_m = {self._settings.reach_m:g}")
 
-    def _require_ready(self, frame: NavigationFrame) -> None:
+    def _pose_in(self, frame: NavigationFrame) -> Array:
+        """Return the pose (3,) of the base in a frame. Raise OmnidError where nothing can be driven in it."""
         _raise_if(refusal_to_drive(self._situation(), frame, self._settings.map_sigma_m))
+        return self._situation().pose_in(frame)
 
     def _situation(self) -> Situation:
         if self._now is None:
@@ -252,10 +330,11 @@ class NavigationStage:
         return self._now._replace(in_map=self._in_map, wheels=self._wheels)
 
     def _update(self, now: Navigation, *, always: bool = False) -> NavigationUpdate | None:
-        navigator, routes, answers = self._navigator, self._routes, tuple(self._answers)
+        navigator, answers, recorder = self._navigator, tuple(self._answers), self._recorder
         stamp_ns = 0 if self._now is None else self._now.stamp_ns
         plan, self._plan = self._plan, None
-        state = (now.state, now.reason, navigator.task, routes.teaching, routes.taught, answers)
+        teaching = recorder.name if recorder else ""
+        state = (now.state, now.reason, navigator.task, teaching, self._taught, answers)
         same = state == self._given and now.setpoint is None and plan is None
         if same and not always and stamp_ns - self._given_ns < REPEAT_NS:
             return None
@@ -272,26 +351,25 @@ class NavigationStage:
             now.left_m,
             now.offset_m,
             len(drive.paths) if drive else 0,
-            routes.teaching,
-            routes.taught_m,
-            routes.taught,
+            teaching,
+            recorder.length_m if recorder else 0.0,
+            self._taught,
             answers,
             plan,
         )
 
 
-def _word(request: NavigationRequest) -> str:
-    """Return a request in a word."""
-    match request:
+def _word(command: NavigationCommand) -> str:
+    """Return the request of a command in a word."""
+    match command.request:
         case GoalRequest():
             return "goal"
         case PathRequest():
             return "path"
-        case RouteRequest():
-            return f"{request.action} {request.name}".strip()
-        case TaughtRoute():
-            return RouteAction.FINISH
-    return str(request)
+        case RouteRequest(action, name):
+            return f"{action} {name}".strip()
+        case verb:
+            return str(verb)
 
 
 def _raise_if(refusal: str) -> None:

@@ -79,13 +79,13 @@ class RouteRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaughtRoute:
-    """A route that is to be written. As a request: it was written, or `refusal` says why it was not."""
+    """A route that is to be written."""
 
     route: Route
     id: int  # id of the request to finish the recording
 
 
-NavigationRequest: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest | TaughtRoute
+NavigationRequest: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest
 
 
 class NavigationCommand(NamedTuple):
@@ -106,7 +106,7 @@ def may_begin_motion(request: NavigationRequest) -> bool:
     """True if a request may begin or resume a motion."""
     if isinstance(request, RouteRequest):
         return request.action is RouteAction.REPEAT
-    return not stops_motion(request) and not isinstance(request, TaughtRoute)
+    return not stops_motion(request)
 
 
 def stops_motion(request: NavigationRequest) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +19,6 @@ from calib.rig_file import read_rig
 from drivers.frame import CAMERAS, Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.core.navigation.requests import NavigationCommand, TaughtRoute
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.column_finding import PanoramaPair
 from omnid.core.rig.rig_health import RigHealth
@@ -194,15 +192,13 @@ def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: l
     assert sum(drops.values()) == sum(drops[name] for name in inboxes)
 
 
-def test_the_map_is_copied_for_a_route_that_was_written_and_for_requests(
-    place: Geometry, poses: list[OdometryUpdate]
-) -> None:
-    places, route = Places(place, CONFIG, FrontEnd(place, CONFIG).dense), Any
-    failed = NavigationCommand(TaughtRoute(route, 7), 0, refusal="the disk is full")  # type: ignore[arg-type]
-    assert places.process(failed) is None and places.process(poses[0]).copy is None
-    assert places.process(failed._replace(refusal="")) is None and places.process(SaveMap(9)) is None
-    copied = places.process(poses[1]).copy
-    assert copied is not None and copied.ids == (9,) and places.process(poses[2]).copy is copied
+def test_the_map_is_copied_for_requests(place: Geometry, poses: list[OdometryUpdate]) -> None:
+    places = Places(place, CONFIG, FrontEnd(place, CONFIG).dense)
+    first = places.process(poses[0])
+    assert first is not None and first.copy is None and places.process(SaveMap(9)) is None
+    second, third = places.process(poses[1]), places.process(poses[2])
+    assert second is not None and third is not None
+    assert second.copy is not None and second.copy.ids == (9,) and third.copy is second.copy
 
 
 def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: list[Frame]) -> None:

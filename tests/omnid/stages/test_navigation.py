@@ -30,10 +30,10 @@ from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import MapKeyframes, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
-from omnid.runs.route_files import RouteFiles
+from omnid.runs.route_files import RouteFiles, TaughtRoutes
 from omnid.stages.navigation import NavigationStage
-from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
+from omnid.transport.topics import Answer
 from tests.omnid.core.navigation.driven_base import Floor
 
 T_BASE_RIG = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [0.1, -0.2, 0.9])
@@ -44,21 +44,29 @@ DEPTH: Any = None  # the stage reads none
 UNIT = np.eye(6) * 1e-6
 
 
-def fixed_map(stamp_ns: int = 5, *, is_new: bool = False) -> Routes:
-    """Return routes in a map with one keyframe, which stands still."""
-    routes = Routes("site.omap", np.eye(4), is_new=is_new)
-    routes.keyframes = MapKeyframes({3: stamp_ns}, {3: np.eye(4)})
-    return routes
+def fixed_map(
+    settings: NavigationSettings,
+    collision: CollisionSettings,
+    T_base_rig: np.ndarray,
+    stamp_ns: int = 5,
+    *,
+    is_new: bool = False,
+) -> NavigationStage:
+    """Return a stage in a map with one keyframe, which stands still."""
+    stage = NavigationStage(settings, collision, T_base_rig, np.eye(4), "site.omap", is_new=is_new)
+    stage.keyframes = MapKeyframes({3: stamp_ns}, {3: np.eye(4)})
+    return stage
 
 
 class Robot:
     """A base that follows setpoints exactly, seen through the stage's messages."""
 
-    def __init__(self, folder: Path, routes: Routes | None = None) -> None:
-        self.routes = routes or fixed_map()
-        self.stage = NavigationStage(NavigationSettings(), CollisionSettings(), T_BASE_RIG, self.routes)
+    def __init__(self, folder: Path, **of_map: Any) -> None:
+        self.stage = fixed_map(NavigationSettings(), CollisionSettings(), T_BASE_RIG, **of_map)
         self.stage.process(WheelState(True, False))
         self.files = RouteFiles(RouteFolder(folder))
+        self.written: dict[int, Answer] = {}  # answers to requests to write a route
+        self.writer = TaughtRoutes(RouteFolder(folder), None, self.written.__setitem__)
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
         self.seq = 0
         self.updates: list[NavigationUpdate] = []
@@ -68,9 +76,6 @@ class Robot:
     def send(self, request: NavigationRequest, stamp_ns: int = 0, id: int = 0) -> NavigationUpdate:
         """Return the state after a request and what the files bring."""
         self.take(self.files.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id)))
-        taught = self.updates[-1].taught
-        if taught is not None:
-            self.take(self.files.process(NavigationCommand(taught, 0, id=taught.id)))
         return self.updates[-1]
 
     def take(self, command: NavigationCommand) -> None:
@@ -78,6 +83,7 @@ class Robot:
         update = self.stage.process(command)
         assert update is not None
         self.updates.append(update)
+        self.writer.process(update)
 
     def pass_on(self) -> NavigationUpdate | None:
         """Advance by a period."""
