@@ -1,4 +1,11 @@
-"""Exceptions of the drivers; each message is one line: what was requested, what was found, what to do."""
+"""Exceptions of the drivers, each with one line: what was requested, found, and what to do; and events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+EventCallback: TypeAlias = Callable[[int, str], None]  # takes a level of `logging` and one line of text
 
 
 class DriverError(Exception):
@@ -11,3 +18,12 @@ class FrameDecodeError(DriverError):
 
 class RecordError(FrameDecodeError):
     """A record or a message with invalid content; those after it may be valid. The text identifies the record."""
+
+
+def one_line(error: Exception) -> str:
+    """Return an error of a library in one line of bounded length: it may quote a file, which may contain anything."""
+    return " ".join(str(error).split())[:256] or type(error).__name__
+
+
+def ignore_event(level: int, text: str) -> None:
+    """Drop an event."""

@@ -11,7 +11,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from drivers.logs.rotating_log import RotationSettings
-from drivers.logs.stamps import TimeSource
+from drivers.logs.streams import TimeSource
 from omnid.camera_config import CamerasConfig, PairConfig
 from omnid.controller.motor import MotorSettings
 from omnid.core.control.control_law import ControllerSettings

@@ -16,7 +16,7 @@ from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.log_reader import LogReader
-from drivers.logs.topics import MotionTopics
+from drivers.logs.streams import MotionTopics
 from drivers.motion import MotionSample
 
 MAX_LOG_BYTES: Final = 1 << 30

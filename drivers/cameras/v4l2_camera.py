@@ -17,8 +17,7 @@ from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.camera_state import CameraExposure, CameraState
 from drivers.cameras.v4l2_device import V4l2Stream, device_error
 from drivers.cameras.v4l2_settings import V4l2Settings
-from drivers.errors import DriverError
-from drivers.events import EventCallback, ignore_event
+from drivers.errors import DriverError, EventCallback, ignore_event
 from drivers.frame import Camera, Frame
 
 _PAUSE_S: Final = 0.005  # Pause where poll() reports a device as ready and no buffer is filled.

@@ -3,11 +3,10 @@
 When an image was taken is stated in one of three ways:
 
 1. `rate_hz`: so many images a second, in the natural order of their names, from 0 s on;
-2. a list in the folder of the images or the one above: times.txt or timestamps.txt with a stamp for each image, or any
-   of STAMP_FILES with the names of the images and their stamps, as data.csv of EuRoC and rgb.txt of TUM;
-3. its name: nanoseconds, a whole number of 16 to 19 digits (1403636579763555584.png), or seconds with a decimal point.
-
-A stamp in a list is written as one in a name, in whole seconds, or as a date and a time (2011-09-26 13:02:25.96).
+2. times.txt or timestamps.txt in the folder of the images or the one above: a line with a stamp for each image, in the
+   natural order of their names: seconds, nanoseconds of 16 to 19 digits, or a date and a time as of KITTI;
+3. its name: nanoseconds of 16 to 19 digits as of EuRoC (1403636579763555584.png), or seconds with a decimal point as of
+   TUM.
 """
 
 from __future__ import annotations
@@ -16,38 +15,33 @@ import errno
 import math
 import os
 import re
-import stat
-from collections.abc import Mapping, Sequence
-from decimal import Decimal, InvalidOperation
+from collections.abc import Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from drivers.errors import DriverError, RecordError
-from drivers.logs.compression import MAX_RECORD_BYTES
-from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, Entries, LogFile, Topic
+from drivers.logs.log import ENTRY, LATEST_NS, MAX_ATTACHMENT_BYTES, MAX_RECORD_BYTES, Entries, LogFile, Topic
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 # Images of boards, which OpenCV reads; those of a log have one of SUFFIXES.
 IMAGE_SUFFIXES: Final = frozenset({*SUFFIXES, ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
-STAMP_FILES: Final = ("times.txt", "timestamps.txt", "data.csv", "rgb.txt")
 ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
-NANOSECOND_DIGITS: Final = 16  # Whole numbers of so many digits or more are nanoseconds.
+_LISTS: Final = ("times.txt", "timestamps.txt")
+_NANOSECONDS: Final = re.compile(r"\d{16,19}")
 _MAX_VISITED: Final = 10_000
-_MAX_STAMP_NS: Final = 2**31 * 10**9  # of the times of ROS, which end in 2038
-_GIVE_RATE: Final = "give --rate HZ, which is log.rate_hz of the settings"
 
 
 def image_folders(path: Path) -> list[Path]:
     """Return the folders with images below a folder, among the first 10,000 folders that are visited."""
     found: list[Path] = []
     for visited, (folder, inner, files) in enumerate(os.walk(path)):
-        here = Path(folder)
         inner.sort()
-        if here != path and any(map(_is_image, files)):
-            found.append(here)
+        if Path(folder) != path and any(map(_is_image, files)):
+            found.append(Path(folder))
         if visited >= _MAX_VISITED:
             break
     return found
@@ -71,19 +65,18 @@ class ImageFolder(LogFile):
             raise DriverError(f"{self.name!r}: a rate of {rate_hz:g} images a second is given: expected one above 0")
         self._path = path
         self._images: list[tuple[int, int, Path]] = []  # folder, stamp [ns], file
-        notes, counts = list[str](), dict[str, int]()
+        counts = dict[str, int]()
         for number, folder in enumerate(folders):
-            stamped = _stamped(folder, rate_hz, notes)
+            stamped = _stamped(folder, rate_hz)
             self._images += ((number, stamp_ns, image) for stamp_ns, image in sorted(stamped))
-            name = folder.relative_to(path).as_posix()
-            self.topics[number], counts[name] = Topic(name, COMPRESSED_IMAGE), len(stamped)
+            self.topics[number] = Topic(folder.relative_to(path).as_posix(), COMPRESSED_IMAGE)
+            counts[self.topics[number].name] = len(stamped)
         if rate_hz and len(set(counts.values())) > 1:
             found = ", ".join(f"{count} in {name!r}" for name, count in counts.items())
-            notes.append(
+            self.cut = (
                 f"images of {self.name!r} are missing: found {found}; by a rate they are paired in the order of their "
                 "names, wrongly behind a missing one: write times.txt"
             )
-        self.cut = "; ".join(notes)
 
     def entries(self) -> Entries:
         """Return the places of the images."""
@@ -93,89 +86,47 @@ class ImageFolder(LogFile):
         """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable."""
         _, stamp_ns, path = self._images[offset]
         try:
-            return compressed_image(stamp_ns, _read_regular(path, MAX_RECORD_BYTES))
+            return compressed_image(stamp_ns, _read_file(path, MAX_RECORD_BYTES))
         except OSError as error:
             raise RecordError(f"{str(path)!r} cannot be read: {error.strerror}") from error
 
     def attachments(self) -> dict[str, bytes]:
-        """Return the rig.toml in the folder of the folders, if it is a regular file of at most 16 MiB."""
+        """Return the rig.toml in the folder of the folders, if there is one."""
         try:
-            data = _read_regular(self._path / ATTACHMENT, MAX_ATTACHMENT_BYTES + 1)
+            return {ATTACHMENT: _read_file(self._path / ATTACHMENT, MAX_ATTACHMENT_BYTES)}
         except OSError:
             return {}
-        return {ATTACHMENT: data} if len(data) <= MAX_ATTACHMENT_BYTES else {}
+
+    def close(self) -> None:
+        """Do nothing: no file is kept open."""
 
 
-def _stamped(folder: Path, rate_hz: float, notes: list[str]) -> list[tuple[int, Path]]:
-    """Return stamp [ns] and path of the images of a folder, in the order of names.
-
-    notes: what is missing is added. Raise DriverError where an image has no stamp.
-    """
+def _stamped(folder: Path, rate_hz: float) -> list[tuple[int, Path]]:
+    """Return stamp [ns] and path of the images of a folder; raise DriverError where one has no stamp."""
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
     if rate_hz:
         return [(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
-    # 1. A list.
-    names = {path.name: path for path in paths}
-    for listing in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
-        rows = _rows(listing)
-        named = dict(image for row in rows if (image := _named(row, names, folder)))
-        if named:
-            if len(named) < len(paths):
-                unlisted = f"{len(paths) - len(named)} images of {str(folder)!r} are left out"
-                notes.append(f"{unlisted}: {listing.name} does not list them")
-            return [(_listed_ns(text, path), path) for path, text in named.items()]
-        if rows and listing.name in STAMP_FILES[:2]:
-            if len(rows) != len(paths):
-                raise DriverError(
-                    f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(rows)} lines; "
-                    "they must be as many"
-                )
-            return [(_listed_ns(" ".join(row), path), path) for row, path in zip(rows, paths, strict=True)]
-    # 2. The names.
-    found = []
-    for path in paths:
-        is_stamp = "." in path.stem or (path.stem.isdecimal() and len(path.stem) >= NANOSECOND_DIGITS)
-        stamp_ns = _stamp_ns(path.stem) if is_stamp else None
+    lists = [file for place in (folder, folder.parent) for name in _LISTS if (file := place / name).is_file()]
+    if lists:
+        try:
+            lines = [line.strip() for line in lists[0].read_text("utf-8-sig", "replace").splitlines()]
+        except OSError as error:
+            raise DriverError(f"cannot read the stamps {str(lists[0])!r}: {error.strerror}") from error
+        texts = [line for line in lines if line and not line.startswith("#")]
+        if len(texts) != len(paths):
+            found = f"{len(paths)} images, and its list of stamps {len(texts)} lines"
+            raise DriverError(f"{str(folder)!r} contains {found}; they must be as many")
+    else:
+        # A whole number of fewer digits is no time.
+        texts = [path.stem if "." in path.stem or _NANOSECONDS.fullmatch(path.stem) else "" for path in paths]
+    stamped = [(_stamp_ns(text), path) for text, path in zip(texts, paths, strict=True)]
+    for stamp_ns, path in stamped:
         if stamp_ns is None:
-            raise _no_stamp(path, "is named", path.stem)
-        found.append((stamp_ns, path))
-    return found
-
-
-def _rows(listing: Path) -> list[list[str]]:
-    """Return the words of the lines of a list, without comments and a head; empty without such a file."""
-    try:
-        if not listing.is_file() or listing.stat().st_size > MAX_RECORD_BYTES:
-            return []
-        lines = listing.read_text("utf-8-sig", "replace").splitlines()
-    except OSError as error:
-        raise DriverError(f"cannot read the stamps {str(listing)!r}: {error.strerror}") from error
-    rows = [re.split(r"[\s,;]+", line.strip(" \t,;")) for line in lines if line.strip() and not line.startswith("#")]
-    is_head = bool(rows) and not any(char.isdecimal() for word in rows[0] for char in word)
-    return rows[1:] if is_head else rows
-
-
-def _named(row: Sequence[str], images: Mapping[str, Path], folder: Path) -> tuple[Path, str] | None:
-    """Return the image that a row names, and the row's stamp; a list above the folders may name those of all."""
-    for column, word in enumerate(row):
-        name = Path(word)
-        if name.name in images and name.parent.name in ("", folder.name):
-            return images[name.name], " ".join([*row[:column], *row[column + 1 :]])
-    return None
-
-
-def _listed_ns(text: str, path: Path) -> int:
-    stamp_ns = _stamp_ns(text)
-    if stamp_ns is None:
-        raise _no_stamp(path, "has the stamp", text)
-    return stamp_ns
-
-
-def _no_stamp(path: Path, found: str, text: str) -> DriverError:
-    return DriverError(
-        f"{str(path)!r} {found} {text[:40]!r}: expected nanoseconds of 16 to 19 digits as its name, or seconds in "
-        f"{STAMP_FILES[0]}; else {_GIVE_RATE}"
-    )
+            raise DriverError(
+                f"{str(path)!r} has no stamp: expected nanoseconds of 16 to 19 digits as its name, or seconds in "
+                f"{_LISTS[0]}; else give --rate HZ, which is log.rate_hz of the settings"
+            )
+    return [(stamp_ns, path) for stamp_ns, path in stamped if stamp_ns is not None]
 
 
 def _stamp_ns(text: str) -> int | None:
@@ -183,12 +134,10 @@ def _stamp_ns(text: str) -> int | None:
     try:
         if re.fullmatch(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?", text):
             return int(np.datetime64(text.rstrip("Z").replace(" ", "T"), "ns").astype(np.int64))
-        stamp = Decimal(text if "_" not in text else "")  # Python allows "_" between digits
-    except (InvalidOperation, ValueError):
+        stamp_ns = Decimal(text) * (1 if _NANOSECONDS.fullmatch(text) else 10**9)
+        return int(stamp_ns) if 0 <= stamp_ns < LATEST_NS and "_" not in text else None
+    except (ArithmeticError, ValueError):
         return None
-    places = 0 if text.isdecimal() and len(text) >= NANOSECOND_DIGITS else 9
-    is_time = stamp.is_finite() and 0 <= stamp < _MAX_STAMP_NS // 10**places
-    return int(stamp.scaleb(places)) if is_time else None
 
 
 def _numbers_of(path: Path) -> list[tuple[int, str]]:
@@ -196,9 +145,8 @@ def _numbers_of(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _read_regular(path: Path, most_bytes: int) -> bytes:
-    """Return the first bytes of a file. Raise OSError for anything but a file; a pipe is not waited for."""
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise OSError(errno.EINVAL, "it is no regular file")
-        return file.read(most_bytes)
+def _read_file(path: Path, most_bytes: int) -> bytes:
+    """Return the bytes of a file; raise OSError for a larger one, and for a pipe, which would be waited for."""
+    if not path.is_file() or path.stat().st_size > most_bytes:
+        raise OSError(errno.EINVAL, f"it is no regular file of at most {most_bytes} bytes")
+    return path.read_bytes()

@@ -3,318 +3,224 @@
 They are framed here and not by the package `mcap`, whose readers refuse a file that was cut, end at the first corrupt
 chunk, accept a short read as a message and unpack without a bound. That package parses the small records.
 
-What an index says of the messages in a chunk is not used: the head of each message is read where it is, of chunks that
-are not compressed without the rest. The summary only tells what was defined and counted in a corrupt chunk.
+No index of a file is used: the head of each message is read where it is. The summary only tells what was defined and
+counted in a corrupt chunk.
 """
 
 from __future__ import annotations
 
-import os
+import mmap
 import re
 import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema, Statistics
 
 from drivers.errors import DriverError, RecordError
-from drivers.logs.compression import MAX_RECORD_BYTES, is_packed_message, unpack_chunk
-from drivers.logs.log import (
-    ENTRY,
-    LATEST_NS,
-    MAX_ATTACHMENT_BYTES,
-    MAX_DEFINITION_BYTES,
-    MAX_DEFINITIONS,
-    MAX_NAME,
-    Entries,
-    LogFile,
-    Topic,
-)
-from drivers.logs.ros_messages import HEADER_BYTES
+from drivers.logs.log import ENTRY, LATEST_NS, MAX_ATTACHMENT_BYTES, MAX_RECORD_BYTES, Entries, LogFile, Topic
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-MAX_ALL_ATTACHMENTS_BYTES: Final = 64 * 2**20
 _KEPT_CHUNKS: Final = 4  # that stay unpacked: both cameras, wheels and gyro may have been written one after the other
 _NO_CHUNK: Final = 0  # block of a message outside of chunks, whose offset is in the file
 _HEAD: Final = struct.Struct("<BQ")  # of a record: opcode, length of the content
 _CHUNK: Final = struct.Struct("<16xQII")  # after two times: unpacked size, CRC, length of the compression's name
 _SIZE: Final = struct.Struct("<Q")
+_CRC: Final = struct.Struct("<I")
 _MESSAGE: Final = struct.Struct("<H4xQ8x")  # channel, log time, without sequence and publish time
 # The end of a closed file: head of the footer, start of the summary, CRC of the summary and of what precedes it, magic.
 _END: Final = struct.Struct("<BQQ8xI8s")
-_CRC_BYTES: Final = 4
+_FAULTS: Final = (McapError, struct.error, OSError, EOFError, RuntimeError, ValueError, MemoryError, OverflowError)
 
 
 class Record(NamedTuple):
-    """Position of a record's content in its source."""
+    """A record; the content of one that is cut is shorter."""
 
     opcode: int
-    begin: int  # of the whole record, bytes
-    offset: int  # of its content
-    size: int  # of its content
-    is_cut: bool  # the source ends within the content
-
-    @property
-    def end(self) -> int:
-        """Where the record ends, bytes."""
-        return self.offset + self.size
+    begin: int  # of the whole record in its source, bytes
+    end: int
+    content: memoryview
 
 
-class Packing(NamedTuple):
-    """How the records of a chunk are packed."""
-
-    compression: bytes
-    offset: int  # of the packed records in the file
-    packed_bytes: int
-    unpacked_bytes: int
-    crc: int  # of the unpacked records; 0: unknown
-
-
-class ByteSource:
-    """Bytes of known size: an unpacked chunk."""
-
-    def __init__(self, data: bytes | memoryview = b"") -> None:
-        self._view = memoryview(data)
-        self.size = len(self._view)
-
-    def read_bytes(self, offset: int, size: int) -> bytes | memoryview:
-        """Return up to size bytes from offset."""
-        return self._view[offset : offset + size]
-
-    def content(self, offset: int, size: int) -> memoryview:
-        """Return bytes from offset; raise RecordError where they are too many or incomplete."""
-        if size > MAX_RECORD_BYTES:
-            raise RecordError(f"{size} bytes are more than {MAX_RECORD_BYTES}")
-        data = self.read_bytes(offset, size)
-        if len(data) < size:
-            raise RecordError(f"{len(data)} of {size} bytes could be read")
-        return memoryview(data)
-
-    def records(self, start: int, end: int) -> Iterator[Record]:
-        """Yield the records from offset start on; the last one may be cut. What is no record ends them."""
-        offset = start
-        while offset + _HEAD.size <= end:
-            head = self.read_bytes(offset, _HEAD.size)
-            if len(head) < _HEAD.size:
-                return
-            opcode, size = _HEAD.unpack(head)
-            if opcode == 0:
-                return
-            record = Record(opcode, offset, offset + _HEAD.size, size, is_cut=size > end - offset - _HEAD.size)
-            yield record
-            if record.is_cut:
-                return
-            offset = record.end
+def _records(source: memoryview, begin: int) -> Iterator[Record]:
+    """Yield the records of a file or of an unpacked chunk; the last one may be cut. What is no record ends them."""
+    while begin + _HEAD.size <= len(source):
+        opcode, size = _HEAD.unpack_from(source, begin)
+        if opcode == 0:
+            return
+        record = Record(opcode, begin, begin + _HEAD.size + size, source[begin + _HEAD.size :][:size])
+        yield record
+        begin = record.end
 
 
-class McapFile(LogFile, ByteSource):
-    """A LogFile of one MCAP file, and the source of its bytes; raises DriverError where it cannot be read."""
+class McapFile(LogFile):
+    """A LogFile of one MCAP file; raises DriverError where it cannot be read."""
 
     def __init__(self, path: Path, name: str) -> None:
-        LogFile.__init__(self, name)
-        ByteSource.__init__(self)
-        self._attached: list[Record] = []
-        self._chunks: dict[int, ByteSource] = {}  # the last ones that were unpacked
+        super().__init__(name)
+        self._attached: list[memoryview] = []
         self._types = {0: ""}  # by schema; 0 stands for none
+        self._chunk = lru_cache(_KEPT_CHUNKS)(self._unpacked)
         try:
-            self._file = path.open("rb", buffering=0)
-        except OSError as error:
-            raise DriverError(f"cannot read the log {self.name!r}: {error.strerror}") from error
-        self.size = os.fstat(self._file.fileno()).st_size
-
-    def read_bytes(self, offset: int, size: int) -> bytes:
-        """Return up to size bytes of the file from offset; none after close, or where the disk fails."""
-        try:
-            return os.pread(self._file.fileno(), min(size, MAX_RECORD_BYTES), offset)
-        except (OSError, ValueError):
-            return b""
+            with path.open("rb") as file:
+                self._data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+        except (OSError, ValueError) as error:
+            raise DriverError(f"cannot read the log {self.name!r}: {error}") from error
 
     def close(self) -> None:
-        """Close the file; may be called twice."""
-        self._file.close()
+        """Do nothing: the file is unmapped with its last message."""
 
     def entries(self) -> Entries:
         """Return the places of all messages, chunk by chunk."""
         # 1. The summary of a closed file.
-        footer_at, summary_at, is_valid = self._summary()
-        for record in self.records(summary_at, footer_at) if is_valid else ():
+        found, end, is_whole = [np.empty(0, ENTRY)], len(MAGIC), False
+        summary_at, footer_at = self._summary()
+        for record in _records(self._data[:footer_at], summary_at) if summary_at else ():
             with suppress(RecordError):  # then the data has the definition
-                self._learn(self, record)
+                self._learn(record)
         # 2. The data. In a file that was not closed, its last chunk may be cut.
-        found, end = [np.empty(0, ENTRY)], len(MAGIC)
-        is_whole = False
-        for record in self.records(end, self.size):
-            if record.is_cut and (record.opcode != Opcode.CHUNK or footer_at):
+        for record in _records(self._data, end):
+            is_cut = record.end > len(self._data)
+            if is_cut and (record.opcode != Opcode.CHUNK or footer_at):
                 break
-            end = record.end
+            end = min(record.end, len(self._data))
             if record.opcode == Opcode.DATA_END:
-                is_whole = end == (summary_at or footer_at) and (is_valid or not summary_at)
+                is_whole = end == summary_at
                 break
-            if record.opcode == Opcode.CHUNK:
-                found.append(self._of_chunk(record))
-            elif record.opcode == Opcode.ATTACHMENT and len(self._attached) < MAX_DEFINITIONS:
-                self._attached.append(record)
+            if record.opcode == Opcode.ATTACHMENT:
+                self._attached.append(record.content)
+            elif record.opcode == Opcode.CHUNK:
+                try:
+                    found.append(self._scanned(self._chunk(record.begin), 0, record.begin, is_cut=is_cut))
+                except RecordError as error:
+                    self.faults[record.begin] = f"the chunk at byte {record.begin}: {error}"
             else:
-                found.append(self._scanned(self, record.begin, record.end, _NO_CHUNK, is_cut=True))
+                found.append(self._scanned(self._data[: record.end], record.begin, _NO_CHUNK))
         if not is_whole:
             used = ": used the data before" if any(map(len, found)) else ""
-            self.cut = f"the log {self.name!r} is cut or corrupt after byte {min(end, self.size)} of {self.size}{used}"
+            self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {len(self._data)}{used}"
         return np.concatenate(found)
 
     def read(self, block: int, offset: int) -> memoryview:
-        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
-        try:
-            source = self if block == _NO_CHUNK else self._chunk(block)
-            record = next(source.records(offset, source.size), None)
-            if record is None or record.opcode != Opcode.MESSAGE:
-                raise RecordError(f"at its byte {offset} is no message any more")
-            at = record.offset + _MESSAGE.size
-            return source.content(at, record.end - at)
-        except RecordError as error:
-            raise RecordError(f"the chunk at byte {block}: {error}" if block else str(error)) from error
+        """Return the bytes of the message of an entry."""
+        record = next(_records(self._data if block == _NO_CHUNK else self._chunk(block), offset))
+        return record.content[_MESSAGE.size :]
 
     def attachments(self) -> dict[str, bytes]:
-        """Return name -> bytes of the attachments that are valid and within the limits."""
+        """Return name -> bytes of the attachments that are valid and within the limit."""
         found: dict[str, bytes] = {}
-        left = MAX_ALL_ATTACHMENTS_BYTES
-        for record in self._attached:
-            if record.size > min(left, MAX_ATTACHMENT_BYTES):
-                continue
-            left -= record.size
+        for content in self._attached:
             with suppress(RecordError):
-                body = self.content(record.offset, record.size)
-                attachment, crc = _parsed(Attachment, body), int.from_bytes(body[-_CRC_BYTES:], "little")
-                if not crc or zlib.crc32(body[:-_CRC_BYTES]) == crc:
-                    found[attachment.name[:MAX_NAME]] = attachment.data
+                if _CRC.size < len(content) <= MAX_ATTACHMENT_BYTES:
+                    attachment, (crc,) = _parsed(Attachment, content), _CRC.unpack(content[-_CRC.size :])
+                    if crc in (0, zlib.crc32(content[: -_CRC.size])):
+                        found[attachment.name] = attachment.data
         return found
 
-    def _summary(self) -> tuple[int, int, bool]:
-        """Return where the footer and the summary begin, 0 without one, and whether the summary is valid."""
-        at = max(0, self.size - _END.size)
-        end = self.read_bytes(at, _END.size)
-        if len(end) < _END.size:
-            return 0, 0, False
-        opcode, size, start, crc, magic = _END.unpack(end)
+    def _summary(self) -> tuple[int, int]:
+        """Return where the summary and the footer begin, which is one place without a summary; 0, 0 of a cut file.
+
+        The first one is 0 where the summary is not valid.
+        """
+        at = len(self._data) - _END.size
+        if at <= 0:
+            return 0, 0
+        opcode, size, start, crc, magic = _END.unpack_from(self._data, at)
         if (opcode, size, magic) != (Opcode.FOOTER, _END.size - _HEAD.size - len(MAGIC), MAGIC):
-            return 0, 0, False
-        section = self.read_bytes(start, at - start) if 0 < start < at <= start + MAX_RECORD_BYTES else b""
-        is_right = crc in (0, zlib.crc32(section + end[: -len(MAGIC) - _CRC_BYTES]))
-        return at, start, len(section) == at - start and is_right
+            return 0, 0
+        start = start or at
+        is_valid = start <= at and crc in (0, zlib.crc32(self._data[start : -len(MAGIC) - _CRC.size]))
+        return start if is_valid else 0, at
 
-    def _of_chunk(self, chunk: Record) -> Entries:
-        """Return the entries of a chunk; one that is not compressed is checked when its messages are read."""
-        try:
-            packing = self._packing(chunk)
-            if packing.compression:
-                source = self._chunk(chunk.begin)
-                return self._scanned(source, 0, source.size, chunk.begin, is_cut=chunk.is_cut)
-            end = min(packing.offset + packing.packed_bytes, self.size)
-            found = self._scanned(self, packing.offset, end, chunk.begin, is_cut=chunk.is_cut)
-        except RecordError as error:
-            self.faults[chunk.begin] = f"the chunk at byte {chunk.begin}: {error}"
-            return np.empty(0, ENTRY)
-        found["offset"] -= packing.offset
-        return found
-
-    def _packing(self, chunk: Record) -> Packing:
-        head = self.read_bytes(chunk.offset, min(chunk.size, _CHUNK.size + MAX_NAME + _SIZE.size))
-        size, crc, name_bytes = _unpacked(_CHUNK, head)
-        (packed,) = _unpacked(_SIZE, head[_CHUNK.size + name_bytes :])
-        begin = _CHUNK.size + name_bytes + _SIZE.size
-        if packed > chunk.size - begin:
-            raise RecordError("its content does not match its size and CRC")
-        return Packing(bytes(head[_CHUNK.size : _CHUNK.size + name_bytes]), chunk.offset + begin, packed, size, crc)
-
-    def _chunk(self, begin: int) -> ByteSource:
+    def _unpacked(self, begin: int) -> memoryview:
         """Return the content of a chunk; raise RecordError where it is not the one that was written."""
-        if begin not in self._chunks:
-            chunk = next(self.records(begin, self.size), None)
-            if chunk is None:
-                raise RecordError("it is gone")
-            packing = self._packing(chunk)
-            packed = self.content(packing.offset, min(packing.packed_bytes, self.size - packing.offset))
-            data = unpack_chunk(packing.compression, packed, packing.unpacked_bytes)
-            is_whole = len(packed) == packing.packed_bytes and len(data) == packing.unpacked_bytes
-            if not (chunk.is_cut or (is_whole and packing.crc in (0, zlib.crc32(data)))):
-                raise RecordError("its content does not match its size and CRC")
-            self._chunks[begin] = ByteSource(data)
-        self._chunks[begin] = self._chunks.pop(begin)  # the newest one
-        if len(self._chunks) > _KEPT_CHUNKS:
-            del self._chunks[next(iter(self._chunks))]
-        return self._chunks[begin]
+        record = next(_records(self._data, begin))
+        try:
+            size, crc, name_bytes = _CHUNK.unpack_from(record.content)
+            at = _CHUNK.size + name_bytes + _SIZE.size
+            (packed_bytes,) = _SIZE.unpack_from(record.content, at - _SIZE.size)
+        except struct.error as error:
+            raise RecordError("it is too short") from error
+        if size > MAX_RECORD_BYTES:
+            raise RecordError(f"it unpacks to {size} bytes, more than {MAX_RECORD_BYTES}")
+        packed, compression = record.content[at:][:packed_bytes], bytes(record.content[_CHUNK.size : at - _SIZE.size])
+        # One byte more than stated shows that there are more.
+        try:
+            if compression == b"lz4":
+                data = memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
+            elif compression == b"zstd":
+                data = memoryview(zstandard.ZstdDecompressor().stream_reader(packed).read(size + 1))
+            elif compression:
+                raise RecordError(f"its compression {compression!r} is unknown")
+            else:
+                data = packed
+        except (*_FAULTS, zstandard.ZstdError) as error:
+            raise RecordError(f"it does not unpack: {error}") from error
+        is_whole = len(packed) == packed_bytes and len(data) == size and crc in (0, zlib.crc32(data))
+        if not is_whole and record.end <= len(self._data):
+            raise RecordError("its content does not match its size and CRC")
+        return data
 
-    def _scanned(self, source: ByteSource, begin: int, end: int, block: int, *, is_cut: bool) -> Entries:
+    def _scanned(self, source: memoryview, begin: int, block: int, *, is_cut: bool = False) -> Entries:
         """Return the entries of the messages among records, and learn what the others define.
 
         is_cut: the last one need not be whole.
         """
         found, at = [], begin
-        for record in source.records(begin, end):
-            if record.is_cut:
+        for record in _records(source, begin):
+            if record.end > len(source):
                 break
             at = record.end
             try:
-                if record.opcode == Opcode.MESSAGE:
-                    head = source.read_bytes(record.offset, min(record.size, _MESSAGE.size))
-                    channel, time_ns = _unpacked(_MESSAGE, head)
-                    at_data = record.offset + _MESSAGE.size
-                    start = source.read_bytes(at_data, min(record.end - at_data, HEADER_BYTES))
-                    if is_packed_message(start):
-                        start = source.content(at_data, record.end - at_data)
-                    header_ns = self.header_ns(channel, start)
-                    found.append((channel, min(time_ns, LATEST_NS), header_ns, block, record.begin))
-                else:
-                    self._learn(source, record)
+                if record.opcode != Opcode.MESSAGE:
+                    self._learn(record)
+                    continue
+                if len(record.content) < _MESSAGE.size:
+                    raise RecordError("it is too short")
+                channel, time_ns = _MESSAGE.unpack_from(record.content)
+                header_ns = self.header_ns(channel, record.content[_MESSAGE.size :])
+                found.append((channel, min(time_ns, LATEST_NS), header_ns, block, record.begin))
             except RecordError as error:
                 self.faults.setdefault(block or record.begin, f"the record at byte {record.begin}: {error}")
-        if at != end and not is_cut:
+        if at != len(source) and not is_cut:
             self.faults.setdefault(block, f"the chunk at byte {block}: its last record is not whole")
         return np.array(found, ENTRY)
 
-    def _learn(self, source: ByteSource, record: Record) -> None:
-        """Add a channel, a schema or the counts of messages; names are cut, so that no log can fill the memory."""
-        if record.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
-            return
-        if record.size > MAX_DEFINITION_BYTES or max(len(self._types), len(self.topics)) >= MAX_DEFINITIONS:
-            raise RecordError(f"more than {MAX_DEFINITIONS} channels or schemas, or a large one")
-        body = source.content(record.offset, record.size)
+    def _learn(self, record: Record) -> None:
+        """Add a channel, a schema or the counts of messages."""
         if record.opcode == Opcode.STATISTICS:
-            self.stated.update(_parsed(Statistics, body).channel_message_counts)
+            self.stated.update(_parsed(Statistics, record.content).channel_message_counts)
         elif record.opcode == Opcode.SCHEMA:
-            schema = _parsed(Schema, body)
-            self._types.setdefault(schema.id, ros_name(schema.name[:MAX_NAME]))
-        else:
-            found = _parsed(Channel, body)
+            found = _parsed(Schema, record.content)
+            self._types.setdefault(found.id, _ros_name(found.name))
+        elif record.opcode == Opcode.CHANNEL:
+            found = _parsed(Channel, record.content)
             if found.schema_id not in self._types:
                 raise RecordError(f"the schema {found.schema_id} of the channel {found.id} is unknown")
             kind = self._types[found.schema_id] if found.message_encoding in ("cdr", "ros1") else ""
-            self.topics.setdefault(found.id, Topic(found.topic[:MAX_NAME], kind, found.message_encoding != "ros1"))
+            self.topics.setdefault(found.id, Topic(found.topic, kind, found.message_encoding != "ros1"))
 
 
-def ros_name(schema_name: str) -> str:
+def _ros_name(schema_name: str) -> str:
     """Return package/msg/Type for this, for DDS (sensor_msgs::msg::dds_::Image_) and for ROS 1 (sensor_msgs/Image)."""
     parts = [part for part in re.split(r"/|::", schema_name) if part not in ("msg", "dds_")]
     return f"{parts[0]}/msg/{parts[1].rstrip('_')}" if len(parts) == 2 else schema_name
 
 
-def _unpacked(layout: struct.Struct, data: bytes | memoryview) -> tuple[int, ...]:
-    """Return the numbers with which a record begins; raise RecordError where it is too short."""
-    if len(data) < layout.size:
-        raise RecordError(f"{len(data)} bytes of a record are too short")
-    return layout.unpack_from(data)
-
-
-def _parsed(kind: Any, body: memoryview) -> Any:
+def _parsed(kind: Any, content: memoryview) -> Any:
     """Return a record of mcap; raise RecordError where it is malformed."""
     try:
-        return kind.read(ReadDataStream(BytesIO(body)))
-    except (McapError, struct.error, ValueError, OverflowError) as error:
+        return kind.read(ReadDataStream(BytesIO(content)))
+    except _FAULTS as error:
         raise RecordError(f"a {kind.__name__} record is malformed") from error

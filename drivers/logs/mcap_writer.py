@@ -141,8 +141,8 @@ class LogWriter:
         """Return the channel of a topic and a type."""
         if (topic, schema_name) not in self._channels:
             if schema_name not in self._schemas:
-                text = schema_text(schema_name)
-                self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text.encode())
+                text = schema_text(schema_name).encode()
+                self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text)
             metadata = {"offered_qos_profiles": _TRANSIENT_LOCAL if topic in _KEPT_TOPICS else ""}
             channel = self._writer.register_channel(topic, "cdr", self._schemas[schema_name], metadata)
             self._channels[topic, schema_name] = channel

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from rosbags.rosbag1 import Reader
 
-from drivers.errors import DriverError, RecordError
-from drivers.logs.log import ENTRY, MAX_NAME, Entries, LogFile, Topic
+from drivers.errors import DriverError, RecordError, one_line
+from drivers.logs.log import ENTRY, Entries, LogFile, Topic
 from drivers.logs.ros_messages import HEADER_BYTES
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
@@ -23,19 +24,17 @@ class Ros1Bag(LogFile):
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(name)
-        self._chunks: dict[int, memoryview] = {}  # the last ones that were unpacked
         self._bag = Reader(path)
         try:
             self._bag.open()
             self._file = path.open("rb", buffering=0)
         except Exception as error:  # of any kind, as it trusts the lengths in the bytes
-            reason = " ".join(str(error).split())[:MAX_NAME] or type(error).__name__
-            raise DriverError(
-                f"cannot read the bag {name!r}: {reason}; if its recorder was stopped, try `rosbag reindex`"
-            ) from error
+            reason = f"{one_line(error)}; if its recorder was stopped, try `rosbag reindex`"
+            raise DriverError(f"cannot read the bag {name!r}: {reason}") from error
         for of in self._bag.connections:
-            self.topics[of.id] = Topic(of.topic[:MAX_NAME], of.msgtype[:MAX_NAME], aligned=False)
+            self.topics[of.id] = Topic(of.topic, of.msgtype, aligned=False)
             self.stated[of.id] = len(self._bag.indexes[of.id])
+        self._chunk = lru_cache(_KEPT_CHUNKS)(self._unpacked)
 
     def entries(self) -> Entries:
         """Return the places of all messages by the index, chunk by chunk."""
@@ -55,16 +54,7 @@ class Ros1Bag(LogFile):
 
     def read(self, block: int, offset: int) -> memoryview:
         """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
-        if block not in self._chunks:
-            chunk = self._bag.chunks[block]
-            try:
-                packed = os.pread(self._file.fileno(), chunk.datasize, chunk.datapos)
-                self._chunks[block] = memoryview(chunk.decompressor(packed))
-            except Exception as error:  # of any kind that a decompressor or a closed file raises
-                raise RecordError(f"the chunk at byte {block}: it does not unpack") from error
-        self._chunks[block] = data = self._chunks.pop(block)  # the newest one
-        if len(self._chunks) > _KEPT_CHUNKS:
-            del self._chunks[next(iter(self._chunks))]
+        data = self._chunk(block)
         for _ in ("head", "data"):
             size = int.from_bytes(data[offset : offset + _LENGTH_BYTES], "little")
             begin, offset = offset + _LENGTH_BYTES, offset + _LENGTH_BYTES + size
@@ -72,9 +62,16 @@ class Ros1Bag(LogFile):
             raise RecordError(f"the chunk at byte {block}: the message at its byte {offset} is not whole")
         return data[begin:offset]
 
+    def _unpacked(self, block: int) -> memoryview:
+        """Return the content of a chunk; raise RecordError where it does not unpack."""
+        chunk = self._bag.chunks[block]
+        try:
+            return memoryview(chunk.decompressor(os.pread(self._file.fileno(), chunk.datasize, chunk.datapos)))
+        except Exception as error:  # of any kind that a decompressor or a closed file raises
+            raise RecordError(f"the chunk at byte {block}: it does not unpack") from error
+
     def close(self) -> None:
         """Close the file; may be called twice."""
-        self._chunks.clear()
         if not self._file.closed:
             self._file.close()
             self._bag.close()

@@ -119,17 +119,6 @@ def parse_motion(
     return GyroSample(stamp_ns, x, y, z, of_base=found.header.frame_id == BASE_FRAME)
 
 
-def cdr_of_ros1(kind: str, message: memoryview) -> bytes:
-    """Return a message of ROS 1 in CDR, as ROS 2 has it; raise FrameDecodeError where it is invalid or unknown."""
-    from rosbags.convert.converter import migrate_bytes  # which only recordings of ROS 1 need
-
-    stores = typestore(Stores.ROS1_NOETIC), typestore(Stores.ROS2_HUMBLE)
-    try:
-        return bytes(migrate_bytes(*stores, kind, kind, {}, message, src_is2=False, dst_is2=True))
-    except Exception as error:  # of any kind, as it trusts the lengths in the bytes
-        raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated, invalid or unknown") from error
-
-
 def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
     """Return a message as rosbags decodes it; raise FrameDecodeError for other bytes."""
     store = typestore(Stores.ROS2_HUMBLE if aligned else Stores.ROS1_NOETIC)

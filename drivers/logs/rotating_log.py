@@ -10,6 +10,7 @@ files with other names are deleted. Several programs may share a folder: a file 
 from __future__ import annotations
 
 import logging
+import math
 import os
 import re
 import time
@@ -19,9 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from drivers.backoff import Backoff
-from drivers.errors import DriverError
-from drivers.events import EventCallback
+from drivers.errors import DriverError, EventCallback
 from drivers.logs.log import LATEST_NS
 from drivers.logs.mcap_writer import LogWriter, is_locked
 
@@ -39,7 +38,7 @@ class RotationSettings:
     keep_bytes: int = 20_000 * _MB  # of all files, including the one being written at its full size
     free_bytes: int = 1000 * _MB  # reserved on the disk: with less free space nothing is recorded
     sync_s: float = 3.0  # period of writing to the disk (fsync)
-    retry_s: float = 30.0  # longest wait between two tries after a failure of the disk
+    retry_s: float = 5.0  # wait between two tries after a failure of the disk
 
 
 @dataclass(slots=True)
@@ -61,8 +60,8 @@ class RotatingLog:
     """Writes messages to MCAP files of limited size and age in a folder, each with the attachments.
 
     The folder is made if its parent exists. It never raises: on a full or failing disk, or without its folder, it
-    stops, reports that once by `on_event`, counts lost messages, tries again with growing waits, and reports when it
-    continues. For one thread; `state` may be read from any.
+    stops, reports that once by `on_event`, counts lost messages, tries again, and reports when it continues. For one
+    thread; `state` may be read from any.
     """
 
     def __init__(
@@ -72,16 +71,12 @@ class RotatingLog:
         """name: of the files; characters that could lead out of the folder are replaced."""
         self.state = RotatingLogState()
         self._folder, self._rotation, self._on_event = folder, rotation, on_event
-        self._name = re.sub(r"[^\w.-]", "-", name)
-        self._attachments = dict(attachments)
+        self._name, self._attachments = re.sub(r"[^\w.-]", "-", name), dict(attachments)
         self._writer: LogWriter | None = None
         self._path = folder
-        self._number = 0
         self._own: dict[str, int] = {}  # names of the files of this run, in their order
-        self._start_ns = 0
+        self._start_ns = self._lost_before = 0  # first stamp of the file; lost messages when it stopped
         self._synced_s = self._retry_at_s = 0.0
-        self._backoff = Backoff(rotation.retry_s)
-        self._lost_before = 0  # lost messages when it stopped
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
@@ -89,86 +84,87 @@ class RotatingLog:
         if not 0 <= stamp_ns < LATEST_NS:
             self._refuse(f"{topic!r}: its stamp {stamp_ns} ns is not a time")
             return
-        writer = self._current(stamp_ns)
+        # 1. The file.
+        keep, age_s = self._rotation, abs(stamp_ns - self._start_ns) / 1e9
+        if self._writer is not None and (self._writer.size_bytes >= keep.file_bytes or age_s >= keep.file_s):
+            self.end_file()
+        if self._writer is None and time.monotonic() >= self._retry_at_s:
+            try:
+                self._begin_file(stamp_ns)
+            except DriverError as error:
+                self._stop(error)
+        writer = self._writer
         if writer is None:
             self.state.lost += 1
             return
+        # 2. The message.
         try:
             writer.write(topic, schema_name, data, stamp_ns)
-            self._maintain(writer)
         except DriverError as error:
             if writer.usable:
                 self._refuse(str(error))
             else:
                 self._stop(error)
+            return
+        if self.state.status == "stopped" and writer.persisted:
+            self.state.status, self.state.problem = "recording", ""
+            lost = self.state.lost - self._lost_before
+            self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
+        # 3. The disk.
+        if time.monotonic() - self._synced_s >= keep.sync_s:
+            self._synced_s = time.monotonic()
+            try:
+                writer.sync()
+                self._require_free_space(keep.free_bytes)
+            except DriverError as error:
+                if writer.usable:
+                    self.end_file()
+                self._stop(error)
 
     def end_file(self) -> None:
         """Complete the file, if there is one, and rename it: the next message begins another one."""
-        writer = self._writer
-        if writer is None:
+        if self._writer is None:
             return
         try:
-            writer.close()
+            self._writer.close()
             self._path.rename(self._path.with_suffix(""))
-        except DriverError as error:
+        except (DriverError, OSError) as error:
             self._stop(error)
-        except OSError as error:
-            reason = f"{error.strerror}; is its folder gone?"
-            self._stop(DriverError(f"cannot rename the log {str(self._path)!r}: {reason}"))
         self._writer, self.state.file = None, ""
 
     def close(self) -> None:
         """Complete the file and end the recording."""
         self.end_file()
-        self.state.status, self._retry_at_s = "closed", float("inf")
+        self.state.status, self._retry_at_s = "closed", math.inf
 
-    def _current(self, stamp_ns: int) -> LogWriter | None:
-        """Return the file for a message with this stamp, None where none can be created: then the recording stops."""
-        keep = self._rotation
-        if self._writer is not None:
-            age_s = abs(stamp_ns - self._start_ns) / 1e9
-            if self._writer.size_bytes >= keep.file_bytes or age_s >= keep.file_s:
-                self.end_file()
-        if self._writer is not None or time.monotonic() < self._retry_at_s:
-            return self._writer
+    def _begin_file(self, stamp_ns: int) -> None:
+        """Create a file with the next number that no other program uses; raise DriverError where that is impossible."""
         self._delete_oldest()
+        self._require_free_space(self._rotation.free_bytes + self._rotation.file_bytes)
+        at, number = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9)), 1 + len(self._own)
+        whole = self._folder / f"{self._name}_{at}_{number:03}.mcap"
+        self._path, self._own[whole.name] = whole.with_name(whole.name + _PART), number
+        if os.path.lexists(whole) or os.path.lexists(self._path):
+            self._begin_file(stamp_ns)
+            return
         try:
-            self._require_free_space(keep.free_bytes + keep.file_bytes)
-            self._writer = self._created(stamp_ns)
+            self._writer = LogWriter(self._path, self._attachments, compression="none", exclusive=True)
         except DriverError as error:
-            self._stop(error)
-            return None
+            if not isinstance(error.__cause__, FileExistsError):
+                with suppress(OSError):
+                    self._path.unlink()
+            raise
         self._start_ns, self._synced_s = stamp_ns, time.monotonic()
-        self.state.files += 1
-        self.state.file = str(self._path)
+        self.state.files, self.state.file = self.state.files + 1, str(self._path)
         if self.state.status == "waiting":
             self.state.status = "recording"
-        return self._writer
-
-    def _created(self, stamp_ns: int) -> LogWriter:
-        """Create a file with the next number that no other program uses."""
-        at = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9))
-        while True:
-            self._number += 1
-            whole = self._folder / f"{self._name}_{at}_{self._number:03}.mcap"
-            self._path = whole.with_name(whole.name + _PART)
-            if os.path.lexists(whole):
-                continue
-            self._own[whole.name] = self._number
-            try:
-                return LogWriter(self._path, self._attachments, compression="none", exclusive=True)
-            except DriverError as error:
-                if not isinstance(error.__cause__, FileExistsError):
-                    with suppress(OSError):
-                        self._path.unlink()
-                    raise
 
     def _refuse(self, reason: str) -> None:
         self.state.refused += 1
         if self.state.refused == 1:
             self._on_event(logging.WARNING, f"recording: refused a message; further ones are counted: {reason}")
 
-    def _stop(self, error: DriverError) -> None:
+    def _stop(self, error: Exception) -> None:
         """Close the file; its data on the disk is kept."""
         if self.state.status != "stopped":
             self.state.status, self._lost_before = "stopped", self.state.lost
@@ -183,24 +179,7 @@ class RotatingLog:
                 with suppress(OSError):
                     self._path.unlink()
         self.state.problem, self.state.file = str(error), ""
-        self._retry_at_s = time.monotonic() + self._backoff.next_s()
-
-    def _maintain(self, writer: LogWriter) -> None:
-        """Report that a recording continues; write the file to the disk once per sync_s, and check the free space."""
-        if self.state.status == "stopped" and writer.persisted:
-            self.state.status, self.state.problem = "recording", ""
-            self._backoff.reset()
-            lost = self.state.lost - self._lost_before
-            self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
-        if time.monotonic() - self._synced_s < self._rotation.sync_s:
-            return
-        writer.sync()
-        self._synced_s = time.monotonic()
-        try:
-            self._require_free_space(self._rotation.free_bytes)
-        except DriverError as error:
-            self.end_file()
-            self._stop(error)
+        self._retry_at_s = time.monotonic() + self._rotation.retry_s
 
     def _delete_oldest(self) -> None:
         """Delete the oldest recordings of this name until there is room for one more within the limits.
@@ -208,16 +187,15 @@ class RotatingLog:
         Those of this run are the newest, in their order: the clock may have been set back meanwhile. Files that are
         being written, or cannot be deleted, are kept, and links are none.
         """
-        # 1. Place in this run, time, number, path and size of each file, which sort by age.
-        pattern = re.compile(re.escape(self._name) + rf"_(\d{{8}}T\d{{6}}Z)_(\d{{3,}})\.mcap(?:{re.escape(_PART)})?")
-        found: list[tuple[int, str, int, str, int]] = []
+        # 1. Place in this run, name, path and size of each file, which sort by age.
+        pattern = re.compile(re.escape(self._name) + rf"_\d{{8}}T\d{{6}}Z_\d{{3,}}\.mcap(?:{re.escape(_PART)})?")
+        found: list[tuple[int, str, str, int]] = []
         with suppress(OSError), os.scandir(self._folder) as entries:
             for entry in entries:
-                match = pattern.fullmatch(entry.name)
-                if match and entry.is_file(follow_symlinks=False):
+                if pattern.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
                     with suppress(OSError):  # another program may have deleted it
                         place = self._own.get(entry.name.removesuffix(_PART), 0)
-                        found.append((place, match[1], int(match[2]), entry.path, entry.stat().st_size))
+                        found.append((place, entry.name, entry.path, entry.stat().st_size))
         # 2. From the oldest on.
         count, total_bytes, keep = len(found), sum(size for *_, size in found), self._rotation
         for *_, path, size in sorted(found):

@@ -161,7 +161,8 @@ def _below(path: Path) -> Iterator[Path]:
         yield path
         return
     inside = logs_in(path)
-    if len(inside) > 1 and parts_in_order(inside):
+    parts, gaps = parts_in_order(inside)
+    if len(parts) > 1 and not gaps:
         yield path
         return
     # Links to folders are not followed: they may form circles.

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
+from contextlib import closing
 from dataclasses import asdict
 
+import numpy as np
+
 from drivers.errors import DriverError
-from drivers.logs.open_log import LogInfo, LogState, log_info
+from drivers.logs.log import Log, LogState
+from drivers.logs.open_log import open_log
 from omnid.commands.options import JSON, RATE, command, failed, print_entries, print_json, warn
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
@@ -33,41 +38,38 @@ def info(args: argparse.Namespace) -> int:
     code = 0
     for number, path in enumerate(args.logs):
         try:
-            found = log_info(path, examine=True, rate_hz=args.rate or 0.0)
+            log = open_log(path, args.rate or 0.0)
         except DriverError as error:
             failed(plain(str(error), MAX_LINE))
             code = 2
             continue
         print("\n" * bool(number), end="")
-        _show(found)
-        code = max(code, int(found.state is LogState.BROKEN))
+        with closing(log):
+            _show(log)
+        code = max(code, int(log.state is LogState.BROKEN))
     return code
 
 
-def _show(found: LogInfo) -> None:
+def _show(log: Log) -> None:
     """Print the properties of a log, and the table of its topics. The log may contain anything."""
-    faults = [found.fault] if found.fault else []
-    faults += [f"{found.broken} corrupt chunks or records, which are skipped"] if found.broken else []
-    state = found.state.value
-    if found.state is LogState.BROKEN:
-        state += f": {'; '.join(faults)}"
-    time = ""
-    if found.span_ns is not None:
-        first_ns, last_ns = found.span_ns
+    counts = Counter(message.topic for message in log.messages())  # what cannot be read shows by that
+    faults = [log.cut] if log.cut else []
+    faults += [f"{len(log.faults)} corrupt chunks or records, which are skipped"] if log.faults else []
+    state = f"{log.state.value}: {'; '.join(faults)}" if log.state is LogState.BROKEN else log.state.value
+    logged_ns, time = log.entries["time_ns"], ""
+    if logged_ns.size:
+        first_ns, last_ns = int(logged_ns.min()), int(logged_ns.max())
         time = f"{utc(first_ns)} to {utc(last_ns)}, {(last_ns - first_ns) / 1e9:.3f} s"
-    listed = ", ".join(f"{name} ({_bytes(size)})" for name, size in found.attachments.items())
-    entries = {"log": str(found.path), "size": _bytes(found.size_bytes), "state": state, "time": time}
-    entries |= {"messages": str(found.messages), "attachments": listed or "none"}
+    listed = ", ".join(f"{name} ({_bytes(len(data))})" for name, data in log.attachments().items())
+    entries = {"log": str(log.path), "size": _bytes(log.size_bytes), "state": state, "time": time}
+    entries |= {"messages": str(counts.total()), "attachments": listed or "none"}
     print_entries({name: plain(text, MAX_LINE) for name, text in entries.items()})
-    rows = [
-        (
-            plain(name, MAX_LINE),
-            plain(kind) or "-",
-            count,
-            f"{found.rates_hz[name]:.2f}" if name in found.rates_hz else "-",
-        )
-        for name, (kind, count) in found.topics.items()
-    ]
+    rows = []
+    for number, (name, kind) in enumerate(log.topics.items()):
+        span_s = 1e-9 * np.ptp(logged_ns[log.topic == number]) if counts[name] > 1 else 0.0
+        rate = f"{(counts[name] - 1) / span_s:.2f}" if span_s else "-"
+        rows.append((plain(name, MAX_LINE), plain(kind) or "-", counts[name], rate))
+    rows.sort()
     if rows:
         wide, wide_kind = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:2])
         print(f"\n{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}")

@@ -9,13 +9,13 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib.atomic_file import write_file
 from drivers.errors import FrameDecodeError
-from drivers.logs.open_log import log_info
 from omnid.client import Robot
 from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, command, settings_of, warn
 from omnid.config import Config
@@ -24,7 +24,7 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import plain
-from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader, choose_odometry_topic, no_pose
+from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
 from omnid.sinks.files import check_outputs, on_stdout
@@ -112,18 +112,18 @@ def _viewer() -> str:
 
 def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | None) -> None:
     """Draw what is recorded. Raise OmnidError where there is no pose in it."""
-    found = log_info(log)
-    reader = RecordingReader(found, choose_odometry_topic(found, topic, robot))
     broken_images = 0
-    for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
-        try:
-            sink.draw(message.content)
-        except FrameDecodeError:
-            broken_images += 1
-    if unreadable := reader.unreadable.total() + reader.damaged + broken_images:
+    with closing(RecordingReader(log, topic, robot)) as reader:
+        for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
+            try:
+                sink.draw(message.content)
+            except FrameDecodeError:
+                broken_images += 1
+    damaged = len(reader.log.faults) + bool(reader.log.cut)
+    if unreadable := reader.unreadable.total() + damaged + broken_images:
         warn(f"{log}: {unreadable} messages or pieces cannot be read")
     if not sink.poses:
-        raise no_pose(log, reader.topic)
+        raise reader.no_pose()
 
 
 def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:

@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame
-from drivers.logs.log import listed
-from drivers.logs.open_log import LogInfo, open_log
+from drivers.logs.log import Log, listed
+from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.errors import OmnidError
 from omnid.transport.codec import (
@@ -42,7 +41,7 @@ IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # i
 Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | Frame
 
 
-def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str | None = None) -> str:
+def choose_odometry_topic(log: Log, topic: str | None, robot: str | None) -> str:
     """Return the topic of the poses.
 
     1. A topic or a robot that the user names; it must hold nav_msgs/msg/Odometry.
@@ -53,7 +52,8 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
     topic: the full name, such as /omnid/odom; robot: stands for /<robot>/odom. Raise OmnidError where there is no
     such topic, or several and none is named.
     """
-    known = [name for name, (schema, count) in found.topics.items() if schema == ODOMETRY_SCHEMA and count]
+    counts = log.counts()
+    known = [name for name, schema in sorted(log.topics.items()) if schema == ODOMETRY_SCHEMA and counts[name]]
     if topic is None and robot is not None:
         topic = f"/{robot.strip('/')}/{ODOMETRY}"
     own = [name for name in known if name.endswith(f"/{ODOMETRY}")]
@@ -65,20 +65,13 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
         wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}: found {listed(known, 'none')}; name one of these topics"
     elif known:
         wrong = f"several topics with {ODOMETRY_SCHEMA}: {listed(known)}; choose one with --topic"
-    elif any(schema in IMAGE_TYPES for schema, _ in found.topics.values()):
-        rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
-        command = f"`omnid replay {found.path}{rig} --record out.mcap`"
+    elif any(schema in IMAGE_TYPES for schema in log.topics.values()):
+        rig = "" if "rig.toml" in log.attachments() else " --rig rig.toml"
+        command = f"`omnid replay {log.path}{rig} --record out.mcap`"
         wrong = f"images but no {ODOMETRY_SCHEMA}: run {command} and use out.mcap"
     else:
-        wrong = f"no {ODOMETRY_SCHEMA}: found {listed(found.topics, 'none')}; expected a recording of a run"
-    raise OmnidError(f"{found.path}: {wrong}")
-
-
-def no_pose(path: Path, topic: str) -> OmnidError:
-    """Return the error for a log whose topic of the poses has none that can be read."""
-    return OmnidError(
-        f"{path}: topic {topic!r} has no readable pose; `omnid log info {path}` reports whether the log is complete"
-    )
+        wrong = f"no {ODOMETRY_SCHEMA}: found {listed(log.topics, 'none')}; expected a recording of a run"
+    raise OmnidError(f"{log.path}: {wrong}")
 
 
 class RecordedMessage(NamedTuple):
@@ -90,20 +83,28 @@ class RecordedMessage(NamedTuple):
 
 
 class RecordingReader:
-    """Reads the messages of one robot, the one with the given odometry topic (see choose_odometry_topic).
+    """Reads the messages of one robot of a log, the one with the odometry topic (see choose_odometry_topic).
 
-    unreadable: messages left out, by topic: not of their type, or not finite.
-    corrupt: chunks and records of the file left out. damaged: the same, and its missing end. All three are complete
-    once all messages are read.
+    log: closed by close(). unreadable: messages left out, by topic: not of their type, or not finite; complete once all
+    messages are read.
     """
 
-    def __init__(self, found: LogInfo, odometry_topic: str) -> None:
-        """Read the attachments. Raise DriverError where the file cannot be opened."""
-        self.info, self.topic = found, odometry_topic
-        self.unreadable: Counter[str] = Counter()
-        self.corrupt = self.damaged = 0
-        with closing(open_log(found.path)) as log:
-            self.attachments: Mapping[str, bytes] = log.attachments()
+    def __init__(self, path: Path, topic: str | None = None, robot: str | None = None) -> None:
+        """topic, robot: of the odometry. Raise DriverError without a log, OmnidError without odometry in it."""
+        self.log, self.unreadable = open_log(path), Counter[str]()
+        self.topic = choose_odometry_topic(self.log, topic, robot)
+
+    def close(self) -> None:
+        """Close the log; may be called twice."""
+        self.log.close()
+
+    def no_pose(self) -> OmnidError:
+        """Return the error for a log whose topic of the poses has none that can be read."""
+        path = self.log.path
+        return OmnidError(
+            f"{path}: topic {self.topic!r} has no readable pose; `omnid log info {path}` reports whether the log is "
+            "complete"
+        )
 
     @property
     def robot(self) -> str:
@@ -116,30 +117,26 @@ class RecordingReader:
 
     def image_name(self) -> str:
         """Return the name of the robot's preferred images, "" where there are none."""
-        return next((name for name in IMAGES if self.topic_name(name) in self.info.topics), "")
+        return next((name for name in IMAGES if self.topic_name(name) in self.log.topics), "")
 
     def messages(self, names: Iterable[str]) -> Iterator[RecordedMessage]:
         """Yield the messages of topics with these names."""
         wanted = {self.topic_name(name): name for name in names if name}
-        with closing(open_log(self.info.path)) as log:
-            for message in log.messages(wanted.keys()):
-                name = wanted[message.topic]
-                kind, decode = DECODERS.get(name, ("", None))
-                content: Content
-                try:
-                    if name in IMAGES and message.kind in IMAGE_TYPES:
-                        content = message.image()
-                    elif decode is not None and message.kind == kind:
-                        content = decode(message.cdr())
-                    else:
-                        continue
-                except (OmnidError, FrameDecodeError):
-                    self.unreadable[message.topic] += 1
+        for message in self.log.messages(wanted.keys()):
+            name = wanted[message.topic]
+            kind, decode = DECODERS.get(name, ("", None))
+            content: Content
+            try:
+                if name in IMAGES and message.kind in IMAGE_TYPES:
+                    content = message.image()
+                elif decode is not None and message.kind == kind:
+                    content = decode(message.cdr())
+                else:
                     continue
-                yield RecordedMessage(name, message.log_time_ns, content)
-            damage = log.damage()
-            self.corrupt = damage.broken
-            self.damaged = damage.broken + bool(damage.cut)
+            except (OmnidError, FrameDecodeError):
+                self.unreadable[message.topic] += 1
+                continue
+            yield RecordedMessage(name, message.log_time_ns, content)
 
 
 def _finite_twist(data: bytes) -> TwistRecord:

@@ -15,7 +15,6 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.rig_file import parse_rig
-from drivers.logs.open_log import log_info
 from omnid.formats.tum import POSITION_LIMIT_M
 from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.recordings.recording import (
@@ -25,8 +24,6 @@ from omnid.recordings.recording import (
     STATUS,
     TWIST_COMMAND,
     RecordingReader,
-    choose_odometry_topic,
-    no_pose,
 )
 from omnid.report.charts import Array, Curve
 from omnid.tracking_state import TrackingState
@@ -70,7 +67,7 @@ class Event:
 class RecordedRun:
     """Everything that the report shows of a recording. N poses.
 
-    path, info (LogInfo), topic (of the odometry), robot, attachments, frames (of the odometry)
+    path, log (closed), topic (of the odometry), robot, attachments, frames (of the odometry)
     T_base_rig (4, 4), the identity where no rig that can be read is attached; height_m: of the cameras, 0 if unknown
     start_ns: stamp of the first pose; t_s (N,) rising; T_odom_base (N, 4, 4)
     variances (N, 6) of x y z rx ry rz; velocity (N, 6) m/s, rad/s
@@ -78,8 +75,7 @@ class RecordedRun:
     by_name: times and entries of each part in the order of the file; newest: entries with the newest of all values
     map_xy (M, 2) m: the path in the map; drives: (K, 3) t, m/s, rad/s by topic, DRIVE or TWIST_COMMAND; cloud: the
     newest; resets: number of resets of odometry
-    left_out: messages not of their type, poses out of range or not later than the one before; corrupt: chunks and
-    records of the file left out
+    left_out: messages not of their type, poses out of range or not later than the one before
     """
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
@@ -87,9 +83,9 @@ class RecordedRun:
 
         Raise OmnidError where there is no odometry in it, DriverError where there is no log.
         """
-        self.path, self.info = path, log_info(path)
-        reader = RecordingReader(self.info, choose_odometry_topic(self.info, topic))
-        self.topic, self.robot, self.attachments = reader.topic, reader.robot, reader.attachments
+        reader = RecordingReader(path, topic)
+        self.path, self.log, self.topic, self.robot = path, reader.log, reader.topic, reader.robot
+        self.attachments = reader.log.attachments()
         # 1. All messages.
         poses, map_xy, left_out = list[Pose](), list[Array](), 0
         entries: dict[str, list[tuple[int, DiagnosticStatus]]] = {}
@@ -113,9 +109,10 @@ class RecordedRun:
                     self.cloud = message.content
                 case TwistRecord():
                     drives.setdefault(message.name, []).append(message.content)
+        reader.close()
         if not poses:
-            raise no_pose(path, reader.topic)
-        self.left_out, self.corrupt = reader.unreadable.total() + left_out, reader.corrupt
+            raise reader.no_pose()
+        self.left_out = reader.unreadable.total() + left_out
         # 2. The rig.
         self.T_base_rig, self.height_m = np.eye(4), 0.0
         with suppress(CalibError):

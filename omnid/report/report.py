@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from calib import se3
-from drivers.logs.open_log import LogState
 from omnid.config import Config
 from omnid.errors import OmnidError
 from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
@@ -62,11 +61,10 @@ def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
 
 def _head(run: RecordedRun) -> list[str]:
     """Return the title, the key figures, and warnings."""
-    found, count, end_s = run.info, len(run.t_s), run.end_s
-    state = LogState.BROKEN if run.corrupt and found.state is LogState.WHOLE else found.state
+    count, end_s = len(run.t_s), run.end_s
     source = (
-        f"{run.path}, {found.size_bytes / 1e6:.1f} MB, {state.value}. Poses of {run.frames[1]} in {run.frames[0]} on "
-        f"{run.topic}, from {utc(run.start_ns)}."
+        f"{run.path}, {run.log.size_bytes / 1e6:.1f} MB, {run.log.state.value}. Poses of {run.frames[1]} in "
+        f"{run.frames[0]} on {run.topic}, from {utc(run.start_ns)}."
     )
     rate = f", {(count - 1) / end_s:.1f}/s" if end_s > 0 else ""
     tiles = [("duration", _clock(end_s, end_s)), ("path", f"{run.length_m():.2f} m"), ("poses", f"{count}{rate}")]
@@ -80,8 +78,8 @@ def _head(run: RecordedRun) -> list[str]:
     cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for name, value in tiles)
     # What is missing or doubtful in the log.
     lines = {
-        f"The log is cut or corrupt: {found.fault}.": found.state is LogState.BROKEN,
-        f"{run.corrupt} corrupt chunks or records were skipped.": run.corrupt,
+        f"The log is cut or corrupt: {run.log.cut}.": run.log.cut,
+        f"{len(run.log.faults)} corrupt chunks or records were skipped.": run.log.faults,
         f"{run.left_out} messages were left out: not of their type, out of range, or not in order.": run.left_out,
     }
     return [

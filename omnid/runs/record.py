@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from drivers.events import EventCallback
+from drivers.errors import EventCallback
 from drivers.frame import Camera, FrameSource
 from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config

@@ -16,7 +16,7 @@ from calib.rig_file import parse_rig, rig_toml
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from drivers.logs.ros_messages import JointWheels
-from drivers.logs.topics import MotionTopics
+from drivers.logs.streams import MotionTopics
 from omnid.config import Config
 from omnid.controller.ipc import ControllerStart
 from omnid.controller.link import ControllerLink

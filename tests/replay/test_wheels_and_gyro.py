@@ -17,7 +17,7 @@ from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.logs.log_reader import LogReader
 from drivers.logs.ros_messages import IMU, ODOMETRY
-from drivers.logs.topics import MotionTopics
+from drivers.logs.streams import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.config import load_config
 from omnid.formats.tum import read_tum
@@ -121,9 +121,9 @@ def test_broken_messages_and_topics_that_are_not_clear_are_reported(
         LogReader(log, motion=MotionTopics(wheels="/nothing"))
 
 
-@pytest.mark.parametrize(("shift_s", "words"), [(3600, "3600.0 s after")])
+@pytest.mark.parametrize("shift_s", [3600, -3600])
 def test_sensors_with_another_clock_than_the_images_are_named(
-    scene: Path, samples: list[MotionSample], tmp_path: Path, shift_s: int, words: str
+    scene: Path, samples: list[MotionSample], tmp_path: Path, shift_s: int
 ) -> None:
     def shifted(sample: MotionSample) -> Entry:
         if isinstance(sample, WheelSample):
@@ -133,9 +133,8 @@ def test_sensors_with_another_clock_than_the_images_are_named(
 
     reader = LogReader(saved(tmp_path / "log.mcap", scene, [*map(shifted, samples)]), motion=MotionTopics())
     assert len(list(reader.frames())) == 2 * PAIRS
-    assert [line for line in reader.warnings if "is used" in line] == [
-        f"no sample of the gyro is used: they begin {words} the images by their stamps: are these of another clock?"
-    ]
+    (line,) = reader.warnings
+    assert f"no sample of {GYRO} is used" in line and "another clock" in line
 
 
 def test_a_pose_that_the_wheels_contradict_is_degraded_and_its_sigma_covers_theirs(

@@ -22,12 +22,11 @@ from mcap.writer import CompressionType
 
 from drivers.errors import DriverError, RecordError
 from drivers.frame import Frame
-from drivers.logs import mcap_file
-from drivers.logs.compression import unpack_message
+from drivers.logs.log import LogState, unpack_message
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_file import MAGIC
-from drivers.logs.open_log import LogInfo, LogState, log_info, logs_in
-from drivers.logs.topics import MotionTopics
+from drivers.logs.open_log import logs_in, open_log
+from drivers.logs.streams import MotionTopics
 from drivers.motion import GyroSample
 from tests.drivers.logs.mcap_logs import (
     BARE,
@@ -126,24 +125,26 @@ def test_frames_and_contents_are_the_same_in_every_format(tmp_path: Path, name: 
     with closing(LogReader(path)) as again:
         assert again.pair_estimate() == PAIRS
         assert contents(list(again.frames())) == contents(list(again.frames())) == found
-    info: LogInfo = log_info(path)
-    images = {topic: entry for topic, entry in info.topics.items() if topic != "/imu"}
-    assert [*images.values()] == [(COMPRESSED, PAIRS)] * 2
-    assert info.span_ns == (START_NS, START_NS + (PAIRS - 1) * 10**8 + 10**6)
-    assert info.state is LogState.WHOLE and info.size_bytes > 1000 and info.broken == 0 and not info.fault
+    with closing(open_log(path)) as log:
+        assert log.counts() | {"/imu": 0} == dict.fromkeys(log.topics, PAIRS) | {"/imu": 0}
+        assert {kind for topic, kind in log.topics.items() if topic != "/imu"} == {COMPRESSED}
+        assert log.state is LogState.WHOLE and log.size_bytes > 1000
 
 
-@pytest.mark.parametrize("order", ["camera by camera", "shuffled"])
-@pytest.mark.parametrize("name", ["mcap", "mcap without index", "db3", "bag"])
-def test_a_log_is_read_in_the_order_of_time_however_it_was_written(tmp_path: Path, name: str, order: str) -> None:
-    """As by a writer that put all images of one camera first."""
-    entries = pairs(60)
-    if order == "camera by camera":
-        entries.sort(key=lambda entry: entry.topic)
-    else:
-        random.Random(4).shuffle(entries)
+@pytest.mark.parametrize("name", ["mcap", "db3", "bag"])
+def test_a_log_that_was_written_camera_by_camera_is_read_in_the_order_of_time(tmp_path: Path, name: str) -> None:
+    entries = sorted(pairs(60), key=lambda entry: entry.topic)
     found, reader = read(FORMATS[name](tmp_path, entries))
     assert found == expected(60) and not reader.warnings
+
+
+def test_a_log_without_an_order_is_refused_unless_the_setting_decides(tmp_path: Path) -> None:
+    entries = pairs(60)
+    random.Random(4).shuffle(entries)
+    path = write_log(tmp_path / "log.mcap", entries)
+    with pytest.raises(DriverError, match=r"run back by .*log.time = "):
+        read(path)
+    assert read(path, time="header")[0] == read(path, time="log")[0] == expected(60)
 
 
 def test_an_mcap_of_ros1_has_the_samples_of_its_imu(tmp_path: Path) -> None:
@@ -171,7 +172,7 @@ def test_the_parts_of_a_split_log_are_read_as_one(tmp_path: Path, suffix: str) -
             write_db3(tmp_path / f"part{part}", some).rename(path)
     found, reader = read(folder)
     assert found == expected(33) and not reader.warnings
-    assert log_info(folder).messages == 66 and log_info(folder).state is LogState.WHOLE
+    assert open_log(folder).state is LogState.WHOLE
     (folder / f"bag_5.{suffix}").unlink()
     found, reader = read(folder)
     assert len(found) == 60 and reader.truncated and len(reader.warnings) == 1
@@ -188,15 +189,15 @@ def test_parts_that_metadata_lists_but_are_not_there_are_named(
 ) -> None:
     """The parts may have been unpacked."""
     entries = pairs(12)
-    names = [f"bag_{number}.mcap{suffix}" for number in range(3)]
+    names = [f"bag_{number}.mcap" for number in range(3)]
     for number in {0, 1, 2} - {missing}:
         write_log(tmp_path / f"bag_{number}.mcap", entries[8 * number :][:8])
-    (tmp_path / "metadata.yaml").write_text(METADATA.format("\n".join(f"    - {name}" for name in names)))
+    (tmp_path / "metadata.yaml").write_text(METADATA.format("\n".join(f"    - {name}{suffix}" for name in names)))
     found, reader = read(tmp_path)
     assert len(found) == (24 if missing is None else 16)
     lines = [] if missing is None else [f"are missing: {names[missing]}: used the others"]
     assert len(reader.warnings) == len(lines) and all(line in reader.warnings[0] for line in lines)
-    assert log_info(tmp_path).state is (LogState.WHOLE if missing is None else LogState.BROKEN)
+    assert open_log(tmp_path).state is (LogState.WHOLE if missing is None else LogState.BROKEN)
 
 
 def test_omnids_own_recordings_of_one_run_are_parts(tmp_path: Path) -> None:
@@ -207,7 +208,7 @@ def test_omnids_own_recordings_of_one_run_are_parts(tmp_path: Path) -> None:
     last.write_bytes(last.read_bytes()[:-500])
     found, reader = read(tmp_path)
     assert len(found) > 4 and reader.truncated and "_002.mcap.part" in reader.warnings[0]
-    assert log_info(tmp_path).state is LogState.BROKEN
+    assert open_log(tmp_path).state is LogState.BROKEN
     with closing(LogReader(tmp_path)) as again:
         assert again.attachments() == {"rig.toml": b"one"}
     with last.open("rb") as writer:
@@ -295,7 +296,7 @@ def test_a_cut_database_is_read_up_to_its_end(tmp_path: Path) -> None:
     found = survivors(path)
     assert found is not None
     assert 0 < len(found[0]) < 120 and found[1].truncated and "cut or corrupt" in found[1].warnings[0]
-    assert log_info(path).state is LogState.BROKEN
+    assert open_log(path).state is LogState.BROKEN
 
 
 @pytest.mark.parametrize("name", ["mcap", "db3"])
@@ -328,8 +329,7 @@ def test_a_corrupt_chunk_costs_only_its_own_frames(tmp_path: Path, compression: 
     frames, reader = found
     lost = {frame[2:] for frame in expected} - {frame[2:] for frame in frames}
     assert len(frames) + len(lost) == 60 and 1 <= len(lost) <= 5
-    examined = log_info(path, examine=True)
-    assert examined.state is LogState.BROKEN and examined.broken == 1
+    assert open_log(path).state is LogState.BROKEN
     assert reader.counts["broken_records"] == 1 and not reader.truncated
     assert is_one_fault(reader.warnings)
 
@@ -398,13 +398,6 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
 # Attachments and topics
 
 
-def test_bounds_the_memory_of_all_attachments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_file, "MAX_ALL_ATTACHMENTS_BYTES", 5000)
-    files = [(str(number), bytes(2000)) for number in range(4)] + [("rig.toml", b"version = 1")]
-    path = write_log(tmp_path / "log.mcap", pairs(2), files)
-    assert LogReader(path).attachments().keys() == {"0", "1", "rig.toml"}
-
-
 def test_ignores_a_corrupt_attachment_and_a_corrupt_summary(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2), [("rig.toml", b"version = 1"), ("other", b"2")])
     path.write_bytes(path.read_bytes().replace(b"version = 1", b"version = 7"))
@@ -459,38 +452,19 @@ def test_a_list_holds_the_seconds_of_numbered_images(tmp_path: Path, where: str,
         LogReader(folder)
 
 
-# Lines of a list with two columns, by number, stamp [ns] and camera -> name of the file, a line, folder it is in.
-LISTS: Final[dict[str, tuple[str, Callable[[int, int, str], str], str]]] = {
-    "name and seconds": ("timestamps.txt", lambda n, ns, _: f"frame{n}.jpg;{ns // 10**9}.{ns % 10**9:09d}", "lower"),
-    "nanoseconds": ("times.txt", lambda n, ns, _: str(ns), ""),
-    "EuRoC": ("data.csv", lambda n, ns, _: f"{ns},frame{n}.jpg", "lower"),
-    "TUM": ("rgb.txt", lambda n, ns, camera: f"{ns // 10**9}.{ns % 10**9:09d} {camera}/frame{n}.jpg", ""),
-    "KITTI": ("timestamps.txt", lambda n, ns, _: f"2023-11-14 22:13:{20 + n // 10}.{n % 10}00000000", "lower"),
-}
-
-
-@pytest.mark.parametrize("name", LISTS)
-@pytest.mark.parametrize("head", ["", "#timestamp [ns],filename\n", "stamp name\n"])
-def test_a_list_may_have_names_beside_the_stamps(tmp_path: Path, name: str, head: str) -> None:
-    """In any order of lines where it names the images."""
+def test_a_list_holds_nanoseconds_or_dates_as_of_kitti(tmp_path: Path) -> None:
     folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: f"frame{NUMBERS[stamp_ns]}")
-    file, line, where = LISTS[name]
-    lines: dict[str, list[str]] = {}
-    for number in range(PAIRS):
-        for camera in ("lower", "upper"):
-            stamp_ns = START_NS + STEP_NS * number
-            lines.setdefault(camera if where else "", []).append(line(number, stamp_ns, camera))
-    for camera, of_camera in lines.items():
-        unique = [*dict.fromkeys(of_camera)]
-        if "frame" in unique[0]:
-            unique.reverse()
-        (folder / camera / file).write_text(head + "\n".join(unique))
-    found, reader = read(folder)
-    assert not reader.warnings
-    for camera in ("lower", "upper"):
-        mine = [frame[2:] for frame in found if frame[0] == camera]
-        assert [stamp_ns for stamp_ns, _ in mine] == [START_NS + STEP_NS * number for number in range(PAIRS)]
-        assert [image for _, image in mine] == [frame[3] for frame in expected(PAIRS) if frame[0] == camera]
+    lines: list[Callable[[int], str]] = [
+        lambda n: str(START_NS + STEP_NS * n),
+        lambda n: f"2023-11-14 22:13:{20 + n // 10}.{n % 10}00000000",
+    ]
+    for line in lines:
+        (folder / "timestamps.txt").write_text("\n".join(map(line, range(PAIRS))))
+        found = [frame[2] for frame in read(folder)[0] if frame[0] == "lower"]
+        assert found == [START_NS + STEP_NS * number for number in range(PAIRS)]
+    (folder / "timestamps.txt").write_text("\n".join(f"{n} {n}.5" for n in range(PAIRS)))
+    with pytest.raises(DriverError, match="has no stamp"):
+        LogReader(folder)
 
 
 def test_numbered_images_have_the_stated_rate(tmp_path: Path) -> None:
@@ -505,7 +479,7 @@ def test_numbered_images_have_the_stated_rate(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["frame0", "0000000001", "1_0.5", "1.2.3", "9" * 30])
 def test_a_name_that_is_no_stamp_is_refused_and_names_the_setting(tmp_path: Path, name: str) -> None:
     folder = write_folders(tmp_path / "images", pairs(1), lambda _: name)
-    with pytest.raises(DriverError, match=r"is named .*log\.rate_hz of the settings"):
+    with pytest.raises(DriverError, match=r"has no stamp: .*log\.rate_hz of the settings"):
         LogReader(folder)
 
 

@@ -1,0 +1,206 @@
+"""Which topics of a log are the cameras, the wheels and the IMU, and by which of its two times a message is stamped.
+
+A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. The header is
+the better one, and is used unless it is not set. Headers that do not advance, run back, or count by another clock than
+that of the other camera are refused: `log.time` says which time is used. In a file the images of a camera are in the
+order of their headers, but for late ones, which fill a hole between others. Where a clock was set back, images lie
+beside others instead, or far behind.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DriverError
+from drivers.frame import CAMERAS, Camera
+from drivers.logs.log import listed
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, JOINT_STATE, ODOMETRY, JointWheels
+
+Times: TypeAlias = NDArray[np.int64]  # (N,) [ns]
+TimeSource: TypeAlias = Literal["auto", "header", "log"]
+
+_WORDS: dict[str, Camera] = {
+    **dict.fromkeys(("lower", "bottom", "down"), CAMERAS[0]),
+    **dict.fromkeys(("upper", "top", "up"), CAMERAS[1]),
+}
+_COMPRESSED = "/compressed"  # ends the names of compressed images (image_transport)
+_SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as stamps that hardly advance say.
+_STEP_NS: Final = 500_000_000  # An image is logged by less behind a later one, unless a clock is set.
+_FASTEST: Final = 3.0  # Clocks and images run at rates that differ by less than this factor.
+_FEW: Final = 0.1  # Up to this share of headers may be unset or repeat the one before.
+
+
+def choose_topics(log: str, topics: Mapping[str, str], wanted: Mapping[Camera, str | None]) -> dict[Camera, str]:
+    """Return the topics of the two cameras.
+
+    log: its name for error messages. topics: name -> type. wanted: requested topics, which must exist; a camera
+    without one is identified by a word of its topic's name. Raises DriverError, which lists the candidates, where the
+    choice is ambiguous.
+    """
+    images = [name for name, kind in topics.items() if kind in IMAGE_TYPES and not name.endswith("/compressedDepth")]
+    if not images:
+        raise DriverError(
+            f"no image topics in {log}: found {listed(topics, 'no messages')}; record {IMAGE} or {COMPRESSED_IMAGE} of "
+            "both cameras; `omnid log info` says whether the log was cut"
+        )
+    found: dict[Camera, str] = {}
+    for camera, name in wanted.items():
+        if name is not None:
+            # image_transport publishes an image raw, compressed, or both.
+            transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
+            mine = [topic for topic in transports if topic in images][:1]
+        else:
+            mine = [topic for topic in images if _camera_of(topic) == camera]
+        if len({topic.removesuffix(_COMPRESSED) for topic in mine}) != 1:
+            named = f"{'several' if mine else 'no'} topics named after the {camera} camera"
+            problem = named if name is None else f"no topic {name!r} of images"
+            raise DriverError(f"{problem} in {log}: found {listed(images)}; give --lower and --upper")
+        found[camera] = max(mine, key=lambda topic: topic.endswith(_COMPRESSED))
+    if found["lower"] == found["upper"]:
+        raise DriverError(f"topic {found['lower']!r} of {log} is named for both cameras: expected two topics")
+    return found
+
+
+def _camera_of(topic: str) -> Camera | None:
+    """Return the camera of the first word that names one: /upper/down_sampled is of the upper camera."""
+    return next((_WORDS[word] for word in re.split(r"[^a-z0-9]+", topic.lower()) if word in _WORDS), None)
+
+
+class MotionTopics(NamedTuple):
+    """Topics of wheels and of an IMU; None: chosen by name and type; empty: none."""
+
+    wheels: str | None = None
+    imu: str | None = None
+    joints: JointWheels | None = None  # the wheels are these joints of a JointState; None: they are an Odometry
+
+
+def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopics) -> tuple[set[str], list[str]]:
+    """Return the topics of wheels and IMU; where several might be meant, none, and a warning.
+
+    A topic of odometry is that of wheels if its name contains "wheel", because others are results; a topic of joints
+    may have any name. Raises DriverError for a requested topic that does not exist or is of another type.
+    """
+    chosen, warnings = set[str](), list[str]()
+    # omnid records the wheels of joints as an Odometry.
+    of_joints = wanted.joints and (wanted.wheels or JOINT_STATE in topics.values())
+    wheels = JOINT_STATE if of_joints else ODOMETRY
+    for kind, name, setting in ((wheels, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
+        if name and topics.get(name) != kind:
+            found = f"holds {topics[name]}" if topics.get(name) else "is not"
+            raise DriverError(f"topic {name!r} {found} in {log}; {setting} must be one of {kind}: {listed(topics)}")
+        names = [name] if name else []
+        if name is None:
+            of_kind = (topic for topic, found in topics.items() if found == kind)
+            names = [topic for topic in of_kind if kind != ODOMETRY or "wheel" in topic.lower()]
+        if len(names) > 1:
+            warnings.append(f"{log} has several topics of {kind}: {listed(names)}; none is used: set {setting}")
+        else:
+            chosen.update(names)
+    return chosen, warnings
+
+
+class LoggedImages(NamedTuple):
+    """The N images of a camera in the order of the file."""
+
+    header_ns: Times  # stamps of the headers, 0 where unset
+    log_ns: Times
+
+
+class StampRule(NamedTuple):
+    """By which time the messages of a log are stamped."""
+
+    by_header: bool
+    delay_ns: int  # usual stamp of the lower camera minus the time of logging, for messages whose header is not set
+    warnings: list[str]
+
+    def stamps_ns(self, header_ns: Times, log_ns: Times) -> Times:
+        """Return the stamps (N,) of messages."""
+        return np.where(self.by_header & (header_ns > 0), header_ns, log_ns + self.delay_ns)
+
+
+def stamp_rule(images: Mapping[Camera, LoggedImages], source: TimeSource = "auto") -> StampRule:
+    """Return how the messages of a log are stamped, by the images of both cameras.
+
+    Raise DriverError, by "auto", where the headers cannot be the times at which both cameras took their images.
+    """
+    # 1. Headers that are not set.
+    both, is_auto = [images[camera] for camera in CAMERAS], source == "auto"
+    unset = [int(np.count_nonzero((each.header_ns == 0) & (each.log_ns != 0))) for each in both]
+    is_unset = any(count > max(1, _FEW * len(each.header_ns)) for count, each in zip(unset, both, strict=True))
+    by_header = source == "header" or (is_auto and not is_unset)
+    # 2. Times that are wrong.
+    apart_ns = abs(_delay_ns(both[0]) - _delay_ns(both[1])) if by_header and all(map(_is_live, both)) else 0
+    if is_auto:
+        faults = [_fault(each.header_ns if by_header else each.log_ns, each.log_ns) for each in both]
+        fault = next(filter(None, faults), "")
+        if apart_ns > _STEP_NS and not fault:
+            fault = f"are {apart_ns * 1e-9:.3f} s apart between the cameras"
+        if fault:
+            times = (
+                "stamps of its images' headers" if by_header else "headers of its images are 0, the times of logging"
+            )
+            raise DriverError(
+                f"the {times} {fault}: expected those of one clock that runs on; cut the log there, or choose "
+                'log.time = "log", the times of logging, or "header"'
+            )
+    if not by_header:
+        return StampRule(False, 0, _unset_warning(sum(len(each.log_ns) for each in both) * is_auto))
+    # 3. Cameras whose clocks differ by less.
+    warnings = _unset_warning(sum(unset))
+    if apart_ns and 2 * apart_ns >= min(_step_ns(each.header_ns) for each in both):
+        warnings.append(
+            f"the clocks of the cameras differ by {apart_ns * 1e-9:.3f} s, half a period or more: images of different "
+            'moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
+        )
+    return StampRule(True, _delay_ns(both[0]), warnings)
+
+
+def _unset_warning(count: int) -> list[str]:
+    return [f"used the times of logging for {count} images: the stamps of their headers are 0"] if count else []
+
+
+def _fault(times: Times, log_ns: Times) -> str:
+    """Return why times cannot be those at which a camera took its images; empty where they can.
+
+    The images are in the order of the file; a message that is there twice, logged at one time, counts once.
+    """
+    is_repeated = (np.diff(times, prepend=-1) == 0) & (np.diff(log_ns, prepend=-1) == 0)
+    times = times[~is_repeated & (times > 0)]
+    if len(times) < 2:
+        return ""
+    is_equal, step_ns = np.diff(times, prepend=-1) == 0, _step_ns(times)
+    if np.count_nonzero(is_equal) > max(1, _FEW * len(times)):
+        return "do not advance"
+    if step_ns < _SHORTEST_STEP_NS:
+        return f"are {step_ns / 1000:g} us apart"
+    # An image behind the latest one must fill a hole: closer than half a period to others there is none.
+    times = times[~is_equal]
+    behind_ns = np.maximum.accumulate(times) - times
+    order, place, counts = np.unique(times, return_inverse=True, return_counts=True)
+    gaps_ns = np.concatenate([[np.inf], np.diff(order), [np.inf]])
+    is_crowded = (np.minimum(gaps_ns[:-1], gaps_ns[1:]) <= step_ns / 2) | (counts > 1)
+    is_late = np.append(False, times[1:] <= np.maximum.accumulate(times)[:-1])
+    wrong = np.flatnonzero((is_late & is_crowded[place]) | (behind_ns > _STEP_NS)).tolist()
+    return f"run back by {behind_ns[wrong[0]] * 1e-9:.3f} s at image {wrong[0] + 1}" if wrong else ""
+
+
+def _is_live(images: LoggedImages) -> bool:
+    """True if images were logged at about the rate of their headers, unlike by a conversion."""
+    header_ns, log_ns = map(_step_ns, images)
+    return header_ns < _FASTEST * log_ns and log_ns < _FASTEST * header_ns
+
+
+def _delay_ns(images: LoggedImages) -> int:
+    """Return the usual header minus time of logging; 0 without headers."""
+    is_set = images.header_ns > 0
+    return round(float(np.median((images.header_ns - images.log_ns)[is_set]))) if is_set.any() else 0
+
+
+def _step_ns(times: Times) -> float:
+    """Return the usual step between times, in any order; 0 of fewer than two."""
+    return float(np.median(np.diff(np.sort(times)))) if len(times) > 1 else 0.0
