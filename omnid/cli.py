@@ -38,11 +38,11 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "replay": Entry("replay", "run a recorded log through the stages of the daemon"),
         "demo": Entry("daemon:demo", "replay a sample in real time: files, bus and a simulated motor"),
         "eval": Entry("log:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
-        "calibrate live": Entry("calibrate_board:live", "images of a board, with its coverage and what is missing"),
-        "calibrate rig": Entry("calibrate_board:rig", "a rig.toml from images of a board that both cameras saw"),
-        "calibrate drive": Entry("calibrate_drive", "what drives say about a rig, and the rig that they make"),
+        "calibrate live": Entry("calibrate:live", "images of a board, with its coverage and what is missing"),
+        "calibrate rig": Entry("calibrate:of_board", "a rig.toml from images of a board that both cameras saw"),
+        "calibrate drive": Entry("calibrate:drive", "what drives say about a rig, and the rig that they make"),
         "calibrate import": Entry(
-            "calibrate_import", "a rig.toml from files of other programs, or of two 360-degree cameras"
+            "calibrate:import_rig", "a rig.toml from files of other programs, or of two 360-degree cameras"
         ),
         "cameras": Entry("machine:show_cameras", "list cameras and the udev rule to copy, or show what they see"),
         "arm": Entry("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
@@ -53,10 +53,9 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
         "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
         "route list": Entry("map:list_routes", "the routes in navigation.routes, here"),
-        "route delete": Entry("map:delete_route", "delete a route"),
-        "listen": Entry("tools:listen", "show pose, state, rates and latencies of a robot"),
+        "listen": Entry("machine:listen", "show pose, state, rates and latencies of a robot"),
         "view": Entry("view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
-        "web": Entry("tools:web", "a page with state, path, warnings, stop and arm"),
+        "web": Entry("machine:web", "a page with state, path, warnings, stop and arm"),
         "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
         "record": Entry("daemon:record", "record both cameras to MCAP files until Ctrl-C"),
         "report": Entry("view:report", "one HTML page about a recording: path, events, statistics"),
@@ -67,7 +66,7 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "map save": Entry("map:save", "ask a robot to save its map now, before it is switched off"),
         "doctor": Entry("machine:doctor", "check cameras, motor, rig, rights, bus and disk"),
         "motor test": Entry("machine:test_motor", "turn each wheel, ask what moved, print the settings for that"),
-        "config": Entry("tools:print_config", "print or check settings"),
+        "config": Entry("machine:print_config", "print or check settings"),
         "install-service": Entry("machine:install_service", "install omnid as a systemd service"),
     }
 )

@@ -34,7 +34,7 @@ from omnid.version import __version__
 
 RESULT_FILE = "result.json"
 DONE = {0: "ok", 1: "no pose, or images lost"}  # by the exit code of `omnid replay`
-OUTPUTS = (("--tum", "est.txt"), ("--map-tum", "map_est.txt"), ("--cloud", "cloud.ply"), ("--plan", "plan.png"))
+OUTPUTS = ["--tum=est.txt", "--map-tum=map_est.txt", "--cloud=cloud.ply", "--plan=plan.png"]
 # One thread for each program: as many programs run as there are cores.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 
@@ -76,11 +76,8 @@ def run(args: argparse.Namespace) -> int:
         futures = {client.submit(replay, job, pure=False, retries=1): job for job in jobs if job not in results}
         try:
             for future in import_module("distributed").as_completed(futures, raise_errors=False):
-                job = futures[future]
-                if future.status == "finished":
-                    result = future.result()
-                else:
-                    result = {"status": "failed", "error": one_line(future.exception())}
+                is_done, job = future.status == "finished", futures[future]
+                result = future.result() if is_done else {"status": "failed", "error": one_line(future.exception())}
                 results[job] = result
                 outcome = ": ".join(filter(None, (result["status"], result["error"])))
                 print(f"{len(results)}/{len(jobs)}  {plain(str(job.folder))}: {outcome}", file=sys.stderr)
@@ -133,10 +130,9 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
             "batch: each replay would extend places.map, so that results depend on their order: add "
             "--set places.localize_only=true, or make a map of all logs by `omnid map build`"
         )
-    options = [(f"--{name}", path and path.absolute()) for name, path in (("rig", args.rig), ("config", args.config))]
-    options += [("--lower", args.lower), ("--upper", args.upper), *(("--set", value) for value in args.set)]
-    options += OUTPUTS
-    given = tuple(str(word) for option in options if option[1] is not None for word in option)
+    given = [f"--{name}={path.absolute()}" for name in ("rig", "config") if (path := vars(args)[name])]
+    given += [f"--{name}={topic}" for name in ("lower", "upper") if (topic := vars(args)[name])]
+    given += [f"--set={value}" for value in args.set] + OUTPUTS
     named = [Path(path) for name in map(str, args.logs) for path in glob.glob(name, recursive=True) or [name]]
     logs = sorted({Path(os.path.abspath(log)) for path in named for log in _below(path)})
     if not logs:

@@ -1,6 +1,6 @@
 """`omnid map`: build maps of places from logs, show them, export them, and let a robot save its own.
 
-Also the routes on this computer: `omnid route list`, `delete`.
+Also the routes on this computer: `omnid route list`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from omnid.commands import options
-from omnid.commands.robot import NAME, ask
+from omnid.commands.robot import ask
 from omnid.config import unused_settings
 from omnid.core.places import place_views
 from omnid.core.places.place_map import PlaceMap, PlaceRig
@@ -63,12 +63,9 @@ def build(args: argparse.Namespace) -> int:
         config = replace(config, places=replace(config.places, map=str(new)))
         replayed = ReplayOptions(rig=args.rig, settings=args.config, progress=None if args.quiet else Progress())
         for log in args.logs:
-            try:
-                result = run_log(log, config, replayed)
-            except OmnidError as error:
-                raise OmnidError(str(error).replace(str(new), str(args.output))) from error
+            result = run_log(log, config, replayed)
             for warning in result.warnings:
-                options.warn(f"{log}: {warning.replace(str(new), str(args.output))}")
+                options.warn(f"{log}: {warning}")
             if result.signal:
                 options.failed(f"interrupted: {args.output} was not written")
                 return 128 + result.signal
@@ -168,31 +165,7 @@ def list_routes(args: argparse.Namespace) -> int:
     examples:
       route list
     """
-    folder, code, found = _folder(args), 0, []
-    for name in folder.names():
-        try:
-            found.append(folder.read(name))
-        except OmnidError as error:
-            options.failed(str(error))
-            code = 2
-    for route in found:
+    folder = RouteFolder(Path(options.settings_of(args).navigation.routes))
+    for route in map(folder.read, folder.names()):
         print(f"{route.name:<20} {route.length_m:8.1f} m  {utc(route.created_s * 10**9)}  {route.map_name}")
-    if not found and not code:
-        print(f"no routes in {folder.folder}: teach one (`omnid route teach NAME`)")
-    return code
-
-
-@options.command(NAME, options.SETTINGS)
-def delete_route(args: argparse.Namespace) -> int:
-    """Delete a route.
-
-    examples:
-      route delete morning
-    """
-    _folder(args).delete(args.name)
-    print(f"deleted: {args.name}")
     return 0
-
-
-def _folder(args: argparse.Namespace) -> RouteFolder:
-    return RouteFolder(Path(options.settings_of(args).navigation.routes))

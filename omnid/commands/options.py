@@ -209,7 +209,6 @@ LOG_CAMERAS: Final = f"""{CAMERAS}
 --time auto|header|log=auto  when an image was taken: as log.time of the settings
 {RATE}
 """
-TRUTH: Final = "--truth FILE  the true path of the rig, TUM format"
 
 # Maps of places, and the height of the cameras.
 MAP: Final = """

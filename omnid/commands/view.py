@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from calib.atomic_file import write_file
 from drivers.errors import FrameDecodeError
-from omnid.client import Robot
-from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, command, settings_of, warn
+from omnid.client import CONNECT_S, Robot
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, failed, settings_of, warn
 from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
@@ -48,14 +48,12 @@ def run(args: argparse.Namespace) -> int:
       view out.mcap -o out.rrd
       view --robot rover --connect tcp/robot:7447
     """
-    config, sink = settings_of(args), sink_of(args.output, args.log)
-    try:
+    config = settings_of(args)
+    with closing(sink_of(args.output, args.log)) as sink:
         if args.log is None:
             _draw_robot(sink, config, math.inf if args.seconds is None else args.seconds)
         else:
             _draw_recording(sink, args.log, args.topic, args.robot)
-    finally:
-        sink.close()
     if sink.poses:
         print(f"{sink.poses} poses and {sink.images} images shown", flush=True)
     return int(not sink.poses)
@@ -101,8 +99,6 @@ def _viewer() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    # The viewer would report its use to its makers; `rerun analytics enable` turns that on again.
-    subprocess.run(python("-m", "rerun_cli", "analytics", "disable"), capture_output=True, env=python_environment())
     words = f"-m rerun_cli --bind 127.0.0.1 --port {port} --hide-welcome-screen --expect-data-soon".split()
     # In a session of its own: Ctrl-C does not end a window.
     environment = python_environment(RUST_LOG="warn")
@@ -131,7 +127,7 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
     end_s, signals, state = time.monotonic() + seconds, list[int](), RobotState()
     with (
         handle_stop_signals(lambda number, _: signals.append(number)),
-        Robot(settings=config.bus, timeout_s=2.0) as robot,
+        Robot(settings=config.bus, timeout_s=CONNECT_S) as robot,
     ):
         for topic in (ODOMETRY, MAP_POSE, SCAN, PANORAMA, STATUS, CLOUD):
             robot.on_message(state.put, topic, kept=topic in (STATUS, CLOUD))
@@ -140,10 +136,10 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
             if content is not None:
                 sink.draw(content)
     if not sink.poses:
-        print(f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there", file=sys.stderr)
+        failed(f"no pose of {config.bus.robot} came: `omnid listen` names those that are there")
 
 
-@command(TRUTH)
+@command()
 def report(args: argparse.Namespace) -> int:
     """Write one HTML page about a recording: path, events, statistics.
 
@@ -151,6 +147,7 @@ def report(args: argparse.Namespace) -> int:
         with nav_msgs/msg/Odometry
     -o, --output FILE=report.html     the page
     --topic TOPIC                     the odometry topic, where there are several
+    --truth FILE                      the true path of the rig, TUM format
 
     examples:
       report out.mcap -o report.html

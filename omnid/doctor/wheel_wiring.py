@@ -21,7 +21,6 @@ from omnid.errors import OmnidError
 
 MOVE_S, REST_S = 1.0, 0.3  # duration of a motion in each direction, and of the rest after it
 ANSWER_S: Final = MOVE_S  # A stop is repeated for this time: a busy computer delays answers by parts of it.
-LEAST_COMMANDS: Final = 2  # Commands of a motion: the driver may send a stop in place of the first one.
 
 BEFORE: Final = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair
 away from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to
@@ -129,10 +128,7 @@ def _move(
     """Drive for this time, then stop; return the time for which it drove, s."""
     _stop(motor)  # after a pause the driver sends one in place of the first command
     begin_s = next_s = time.monotonic()
-    sent = 0
-    # A busy computer may have paused this program already: the wheels move nevertheless, if only for a moment.
-    while sent < LEAST_COMMANDS or time.monotonic() < begin_s + duration_s:
-        sent += 1
+    while time.monotonic() < begin_s + duration_s:
         # Without an answer the wheels keep turning, because the controller's watchdog expires much later.
         with suppress(LateReplyError):
             motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))

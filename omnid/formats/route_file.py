@@ -136,12 +136,6 @@ class RouteFolder:
             self.folder.mkdir(parents=True, exist_ok=True)
         write_whole(self.path(route.name), route_bytes(route))
 
-    def delete(self, name: str) -> None:
-        """Delete a route. Raise OmnidError where there is none."""
-        path = self.path(name)
-        with self._reported(path, "delete the route", f"no route {name} in {self.folder}: nothing was deleted"):
-            path.unlink()
-
     @contextmanager
     def _reported(self, path: Path, action: str, absent: str = "") -> Iterator[None]:
         """Turn what the disk says into OmnidError; absent: the error where there is no such file."""

@@ -54,7 +54,7 @@ def test_a_rig_that_fits_as_well_as_any_is_kept(
 ) -> None:
     """A height that is given is written all the same, and one by the floor where the rig states none."""
     as_good = SimpleNamespace(is_better=False, lines=lambda: [])
-    monkeypatch.setattr("omnid.commands.calibrate_drive.calibrate_drive", lambda *_: as_good)
+    monkeypatch.setattr("omnid.commands.calibrate.calibrate_drive", lambda *_: as_good)
     rig = read_rig(scene / "rig.toml")
     write_rig(tmp_path / "high.toml", rig.at_height(0.9))
     out = tmp_path / "out.toml"

@@ -1,0 +1,355 @@
+"""Commands that make a rig.toml: `omnid calibrate live`, `rig`, `drive`, `import`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from contextlib import closing, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from calib import se3
+from calib.atomic_file import write_file
+from calib.boards.aprilgrid import AprilGrid
+from calib.boards.board import Board
+from calib.importers import import_chain, import_pair, read_transform, stacked_rig, straight_up
+from calib.models.names import model_in_words
+from calib.rig import Rig
+from calib.rig_file import png, read_rig, write_rig
+from calib.validation import silent
+from omnid.calibration.board_search import AnyBoard
+from omnid.calibration.drive import calibrate_drive
+from omnid.calibration.from_log import calibrate_height, calibrate_mask
+from omnid.calibration.images import SIDES, open_log, read_pairs
+from omnid.calibration.live_boards import LiveBoards, newest_pairs, status
+from omnid.calibration.rig import calibrate_rig
+from omnid.calibration.rig_check import check_log, with_upper_corrected
+from omnid.commands.options import (
+    HEIGHT,
+    LOG_CAMERAS,
+    QUIET,
+    SETTINGS,
+    command,
+    device_opener,
+    failed,
+    height_of,
+    log_cameras,
+    settings_of,
+    warn,
+)
+from omnid.core.rig.column_finding import RigState
+from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.logging_setup import HANDLER
+from omnid.errors import OmnidError
+from omnid.runs.session import attached_rig
+from omnid.sinks.files import check_outputs
+from omnid.transport.bus import Bus
+from omnid.transport.codec import diagnostics_cdr
+
+# Options that each kind of board needs.
+NEEDED = {"checkerboard": ("corners", "square_mm"), "aprilgrid": ("tags", "tag_mm", "tag_spacing")}
+
+BOARD: Final = """
+board:
+--board checkerboard|aprilgrid=checkerboard  aprilgrid: Kalibr's AprilTags 36h11, which may be half hidden
+--corners 6x7        inner corners (points where four squares meet) along both sides
+--square-mm MM       side of one square
+--tags 6x6           aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)
+--tag-mm MM          aprilgrid: side of one tag (tagSize)
+--tag-spacing RATIO  aprilgrid: space between tags as a fraction of a tag's side, like 0.3 (tagSpacing)
+"""
+
+
+def board_of(args: argparse.Namespace) -> AnyBoard:
+    """Return the board that the options describe; OmnidError where they are not those of one kind of board."""
+    given = {name for names in NEEDED.values() for name in names if getattr(args, name) is not None}
+    if given != set(NEEDED[args.board]):
+        needed = ", ".join(f"--{name.replace('_', '-')}" for name in NEEDED[args.board])
+        raise OmnidError(f"--board {args.board}: expected {needed}, and no options of another kind of board")
+    if args.board == "aprilgrid":
+        columns, rows = args.tags
+        return AprilGrid(columns, rows, args.tag_mm / 1e3, args.tag_spacing)
+    columns, rows = args.corners
+    return Board(columns, rows, args.square_mm / 1e3)
+
+
+@command(BOARD, LOG_CAMERAS, HEIGHT, QUIET)
+def of_board(args: argparse.Namespace) -> int:
+    """Make a rig.toml from images of a board that both cameras saw at once.
+
+    Warnings go to stderr.
+
+    images LOG|DIR    a log of both cameras, or a folder with lower_*.png, upper_*.png of the same names
+    -o, --output FILE  the rig.toml to write (required)
+    --expected-baseline-mm MM 0.001..  the measured distance of the mirrors: a result that differs by more than a tenth
+        is refused
+    --view mirror|direct  the world is seen in a mirror or directly through a lens; the tags of an AprilTag grid show
+        it, a checkerboard does not
+    --report FILE     write an HTML report with residuals and panoramas
+
+    examples:
+      calibrate rig boards.mcap --corners 6x7 --square-mm 30 --view mirror -o rig.toml
+      calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml
+    """
+    board = board_of(args)
+    named = [("--output", args.output), ("--report", args.report)]
+    read = [("a file that is read", args.images)]
+    check_outputs([(name, path) for name, path in named if path is not None], read)
+    expected_mm = args.expected_baseline_mm
+    found = calibrate_rig(
+        args.images,
+        board,
+        topics=log_cameras(args),
+        view=args.view,
+        expected_baseline_m=None if expected_mm is None else expected_mm / 1e3,
+        progress=silent if args.quiet else lambda line: print(line, file=sys.stderr),
+    )
+    found = replace(found, rig=found.rig if args.height_m is None else found.rig.at_height(args.height_m))
+    found.save(args.output)
+    if args.report:
+        found.save_report(args.report)
+    for line in found.warnings:
+        warn(line)
+    for line in found.tables:
+        print(line)
+    print(f"{args.output}: {found}")
+    print(f"{args.output}: {height_of(found.rig)}")
+    return 0
+
+
+@command(BOARD, SETTINGS)
+def live(args: argparse.Namespace) -> int:
+    """Search the board in the images of both cameras as they come.
+
+    Pairs in which it stands still at a new place are written to DIR; the terminal says what is missing and when it is
+    enough, the page (`omnid web`) also shows where it has been. Stop the daemon first: it holds the cameras. Exit code
+    1: not enough yet.
+
+    images DIR                       folder of the images, lower_*.png and upper_*.png; what is there counts, so that it
+        goes on where it ended
+    --lower DEVICE [cameras.lower]   device of the lower camera; default: cameras.lower of the settings
+    --upper DEVICE [cameras.upper]   the same of the upper camera
+
+    examples:
+      calibrate live boards/ --corners 6x7 --square-mm 30 --config /etc/omnid/omnid.toml
+    """
+    config, folder, published_s = settings_of(args), args.images, 0.0
+    with closing(LiveBoards(board_of(args))) as boards:
+        # 1. What is in the folder.
+        folder.mkdir(parents=True, exist_ok=True)
+        names = [{path.stem.removeprefix(f"{side}_") for path in folder.glob(f"{side}_*")} for side in SIDES]
+        if names[0] & names[1]:  # half a pair is left where it was killed between two files
+            read = read_pairs(folder)
+            for name in names[0] & names[1]:
+                boards.process((read.sides[0][name], read.sides[1][name]), need_still=False)
+        number = max((int(name) for name in names[0] | names[1] if name.isascii() and name.isdigit()), default=0)
+        # 2. Pairs of the cameras until Ctrl-C.
+        open_camera = device_opener(config)
+        with (
+            closing(open_camera("lower")) as lower,
+            closing(open_camera("upper")) as upper,
+            closing(Bus(config.bus)) as bus,
+            suppress(KeyboardInterrupt),
+        ):
+            for pair in newest_pairs(lower, upper):
+                outcome, missing = boards.process(pair, need_still=True), "; ".join(boards.missing()) or "enough"
+                if outcome == "kept":
+                    number += 1
+                    for side, image in zip(SIDES, pair, strict=True):
+                        write_file(folder / f"{side}_{number:03d}.png", png(image))
+                if sys.stdout.isatty():  # one line, which the next one replaces
+                    HANDLER.show(f"{boards.pairs} ({outcome}): {missing}")
+                elif outcome == "kept":
+                    print(f"{boards.pairs}: {missing}", flush=True)
+                if time.monotonic() >= published_s + config.live.status_s:
+                    published_s = time.monotonic()
+                    bus.publish("status", diagnostics_cdr(time.time_ns(), [status(boards, outcome)]))
+    HANDLER.show("")
+    if missing := "; ".join(boards.missing()):
+        return failed(f"{boards.pairs} pairs, not enough yet: {missing}")
+    print(f"{boards.pairs} pairs, enough: `omnid calibrate rig {folder}` with the same options of the board")
+    return 0
+
+
+@command(LOG_CAMERAS, HEIGHT)
+def drive(args: argparse.Namespace) -> int:
+    """Adjust all parameters of a rig to drives with turns, without a board.
+
+    Then find the height of the cameras, if the rig states none, and what is fixed to them, where the first log shows
+    it. Exit code 1: the rig has drifted (--only check), the ruler contradicts, or nothing was found that could be
+    written.
+
+    logs LOG...        drives with turns; 100 to 350 pairs
+    --rig FILE         the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images,
+        baseline by ruler; default: the one attached to the first log
+    --only check|height|mask...  only this, by the first log; may be repeated. check: compare the rig with the images,
+        and correct the upper camera's pose; height: height and tilt of the cameras by the floor; mask: hide what is
+        fixed to the cameras, by a log in which the robot turns once
+    --ruler-m M 0.1..10     the height by ruler, as a check of that by the floor
+    -o, --output FILE  the rig.toml to write; may be the file of --rig
+
+    examples:
+      calibrate drive drive.mcap --rig rig.toml -o better.toml
+      calibrate drive drive.mcap --only check
+      calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml
+    """
+    # 1. The rig to start from.
+    if args.output is not None:
+        check_outputs([("--output", args.output)], [("the log that is read", log) for log in args.logs])
+    if args.rig is not None:
+        start = read_rig(args.rig)
+    else:
+        with closing(open_log(args.logs[0], log_cameras(args), None)) as reader:
+            start = attached_rig(reader, args.logs[0])
+    prepare_kernels()
+    # 2. Check the rig, or adjust all of it.
+    rig, has_drifted = start, False
+    if not args.only:
+        rig = _adjusted(args, rig)
+    elif "check" in args.only:
+        rig, has_drifted = _checked(args, rig)
+    # 3. Find the height, and the masks; a log that shows none of them is no error but for --only.
+    rig, contradiction = _at_height(args, rig)
+    if not args.only or "mask" in args.only:
+        try:
+            mask = calibrate_mask(args.logs[0], rig, log_cameras(args))
+            print(mask)
+            rig = mask.rig if mask.share or args.only else rig
+        except OmnidError as error:
+            if args.only:
+                raise
+            print(error)
+    # 4. Write the rig.
+    if contradiction:
+        return failed(f"{contradiction}; nothing was written")
+    if args.output is not None and rig is start:
+        print("nothing was written")
+    elif args.output is not None:
+        write_rig(args.output, rig)
+        print(f"{args.output}: written, {height_of(rig)}")
+    is_found = rig is not start or bool(args.only)
+    return 0 if is_found and not has_drifted else 1
+
+
+def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
+    """Return the rig that fits the drives best; the same one if none fits them better."""
+    found = calibrate_drive(args.logs, rig, log_cameras(args), lambda line: print(line, file=sys.stderr))
+    print("\n".join(found.lines()))
+    if not found.is_better:
+        print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
+        return rig
+    if found.is_misfit:
+        warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
+    return found.rig
+
+
+def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:
+    """Return the rig, with its upper camera's pose corrected if it is to be written, and whether it had drifted."""
+    found, pairs = check_log(args.logs[0], rig, log_cameras(args))
+    print(found)
+    if args.output is not None:
+        rig, remains = with_upper_corrected(rig, pairs, found)
+        print(f"{args.output}: {remains}")
+    return rig, found.finding.state is not RigState.FITS
+
+
+def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
+    """Return the rig with the height that is given, or else by the floor, and how the ruler contradicts it ("").
+
+    Without --only, a height that the rig states is kept, and a floor that is not seen is no error.
+    """
+    if args.height_m is not None:
+        return rig.at_height(args.height_m), ""
+    is_wanted = args.ruler_m is not None or "height" in args.only
+    if not is_wanted and (args.only or rig.height_m() is not None):
+        return rig, ""
+    try:
+        found = calibrate_height(args.logs[0], rig, log_cameras(args))
+    except OmnidError as error:
+        if is_wanted:
+            raise
+        print(error)
+        return rig, ""
+    print(found)
+    print(f"the rig so far: {height_of(rig)}")
+    if args.ruler_m is not None:
+        contradiction = found.contradiction(args.ruler_m)
+        if contradiction:
+            return rig, contradiction
+        print(f"{args.ruler_m:.3f} m by ruler agrees")
+    return found.rig, ""
+
+
+@command(HEIGHT)
+def import_rig(args: argparse.Namespace) -> int:
+    """Make a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras.
+
+    camchain [FILE]  both cameras: Kalibr's camchain.yaml
+    --lower CAMERA   the lower camera: its name in the camchain (cam0), or its file: OCamCalib's calib_results.txt
+    --upper CAMERA   the same for the upper camera
+    --equirectangular 3840x1920  two 360-degree cameras one above the other, with stitched images of this size; with
+        --baseline
+    --view mirror|direct        OCamCalib: the world is seen in a mirror (default) or directly through a lens
+    --frame imu|cameras=imu     the rig frame of a file with T_cam_imu: that of the IMU, whose z must point up; cameras:
+        the origin at the lower viewpoint, z to the upper one, x ahead
+    -o, --output FILE           the rig.toml to write (required)
+    --replace                   write it in the place of an existing file
+
+    one of:
+    --transform FILE  the 16 numbers of T_lower_upper, row by row
+    --baseline M 0.001..5  metres from the lower viewpoint straight up to the upper one; both cameras look up and are
+        equally oriented
+
+    examples:
+      calibrate import camchain.yaml -o rig.toml
+      calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml
+    """
+    read = [path for path in (args.camchain, args.lower, args.upper, args.transform) if path]
+    check_outputs([("--output", args.output)], [("a file that is read", Path(path)) for path in read])
+    rig = _imported(args)
+    if args.height_m is not None:
+        rig = rig.at_height(args.height_m)
+    if args.output.exists() and not args.replace:
+        raise OmnidError(f"--output {args.output} exists: --replace writes the rig in its place")
+    write_rig(args.output, rig)
+    print(f"{args.output}: {describe(rig)}")
+    return 0
+
+
+def _imported(args: argparse.Namespace) -> Rig:
+    files = bool(args.transform or args.view)
+    if args.equirectangular:
+        if args.baseline is None or args.camchain or args.lower or args.upper or files:
+            raise OmnidError("--equirectangular: expected --baseline METRES beside it, and no file")
+        return stacked_rig(args.equirectangular, args.baseline)
+    if args.camchain is not None:
+        if files or args.baseline is not None:
+            raise OmnidError("--transform, --baseline and --view belong to files of OCamCalib: Kalibr's state them")
+        return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, warn)
+    if not (args.lower and args.upper and (args.transform or args.baseline is not None)):
+        raise OmnidError(
+            "calibrate import: expected a Kalibr camchain.yaml, or two files of OCamCalib as --lower and --upper with "
+            "--transform FILE or --baseline METRES"
+        )
+    T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
+    return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", warn)
+
+
+def describe(rig: Rig) -> str:
+    """Return one line about a rig: cameras, topics, baseline, rotation between the cameras, height."""
+    T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
+    rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(T_upper_lower))))
+    lower, upper = (
+        f"{model_in_words(mounted.camera)} {'x'.join(map(str, mounted.camera.size))}" + (f" ({topic})" if topic else "")
+        for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True)
+    )
+    delay_ms = 1e3 * rig.times.upper_delay_s
+    late = f"upper exposed {delay_ms:+.1f} ms against its stamps, " if delay_ms else ""
+    return (
+        f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
+        f"{rotation_deg:.2f} deg, {late}{height_of(rig)}"
+    )
