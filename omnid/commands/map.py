@@ -97,7 +97,7 @@ def export(args: argparse.Namespace) -> int:
     --ply FILE.ply           landmarks with confidence and age
     --plan FILE.png          landmarks from above, with the paths and loops
     --grid FILE.yaml         occupancy grid for nav2 and map_server; the image beside it is FILE.pgm
-    --cell M=0.05 0.005..10  edge of a cell of the grid, m
+    --cell M=0.05 0.005..10  edge of a cell of the grid, and of the voxels of landmarks, m
 
     examples:
       map export place.omap --grid place.yaml --ply place.ply --plan place.png
@@ -118,13 +118,13 @@ def export(args: argparse.Namespace) -> int:
             )
         write_grid(args.grid, place_views.grid(places, rig, args.cell))
     if args.ply is not None:
-        write_ply(args.ply, place_views.landmarks(places, rig))
+        write_ply(args.ply, place_views.landmarks(places, rig, args.cell))
     if args.plan is not None:
         # A map has the axes of the base, whose origin is on the floor where the rig states the cameras' height.
         height_m = float(rig.T_base_rect[2, 3])
         low_m, high_m = (height_m + at_m for at_m in drawn_heights(height_m))
         paths, loops = place_views.paths_xy(places, rig), place_views.loops_xy(places, rig)
-        write_plan(args.plan, place_views.landmarks(places, rig), paths, (low_m, high_m), loops)
+        write_plan(args.plan, place_views.landmarks(places, rig, args.cell), paths, (low_m, high_m), loops)
     options.print_entries({"written": ", ".join(str(path) for _, path in named)})
     return 0
 

@@ -6,6 +6,7 @@ from typing import Final
 
 S_PER_NS: Final = 1e-9  # exact, by the definition of the prefix
 NS_PER_S: Final = 10**9
+STAMP_JITTER_NS: Final = 5_000_000  # What is early by less is due, because stamps of cameras jitter.
 
 
 class SecondsSinceFirst:

@@ -12,7 +12,7 @@ from omnid.config import MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.core.mapping.voxel_map import VoxelMap
-from omnid.core.nanoseconds import NS_PER_S
+from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.tracking_state import TrackingState
@@ -26,7 +26,6 @@ FRAMES_PER_VOXEL_FRAME = 10
 # the map, but up to 2.4 times as many of its points are wrong (`tests.bench.accuracy --cloud`).
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2
 SAME_VIEW_NS = NS_PER_S  # Least time between two pairs of the same view that enter the map.
-STAMP_JITTER_NS = 5_000_000  # A pair that is early by less is due, because stamps of cameras jitter.
 
 
 class Mapping:

@@ -17,7 +17,7 @@ from omnid.core.control.collision_monitor import ControllerScan, MovingPoint
 from omnid.core.floor import Floor, FloorEstimator
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
-from omnid.core.nanoseconds import NS_PER_S
+from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.posterior import thin_things_m
 from omnid.core.obstacles.ray_scans import RayScans
@@ -26,7 +26,6 @@ from omnid.core.obstacles.unwatched import Unwatched
 from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
-from omnid.stages.mapping import STAMP_JITTER_NS
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.places.place_map import Link, PlaceMap, relative_covariance
-from omnid.core.places.pose_graph import ACCEPTED, PoseEdges, optimise
+from omnid.core.places.pose_graph import PoseEdges, optimise
 
 Array = NDArray[np.float64]
 
 LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
-FITS_M, FITS_RAD = 0.01, 0.003  # A loop that the map fits within this needs no optimisation.
-LOOPS_THAT_FIT: Final = 3  # wait for the next optimisation, more of them in a large map; by trial on development seeds
-KEYFRAMES_PER_LOOP: Final = 50  # one more loop waits per this number of keyframes; by trial on development seeds
+KEYFRAMES_PER_LOOP: Final = 50  # one loop that fits waits per this number of keyframes; by trial on development seeds
 RECENT: Final = 8  # Newest loops, because they show the present drift; a refused loop may be accepted while among them.
 # Share of the squared distances that the drift explains, because the others may be wrong loops, and that quantile of
 # the chi-squared distribution of six dimensions.
@@ -61,7 +59,7 @@ class MapCorrection:
         places = self._places
         places.links += loops
         self._waiting += len(loops)
-        may_wait = self._waiting <= LOOPS_THAT_FIT + len(part) // KEYFRAMES_PER_LOOP
+        may_wait = self._waiting <= len(part) // KEYFRAMES_PER_LOOP
         if may_wait and not self._is_due and all(map(self._fits, loops)):
             return
         self._waiting, self._is_due = 0, False
@@ -86,7 +84,7 @@ class MapCorrection:
         places.poses.update(zip(part, result.poses, strict=True))
         # 4. Loops that the graph refuses go, but the newest ones.
         recent = [id(link) for link in links if link.is_loop][-RECENT:]
-        bad = {id(links[n]) for n in np.flatnonzero(result.weights < ACCEPTED)}.difference(recent)
+        bad = {id(links[n]) for n in np.flatnonzero(~result.accepted)}.difference(recent)
         places.links = [link for link in places.links if id(link) not in bad]
         # 5. The covariance of later poses in the map.
         newest = places.keyframes[part[-1]]
@@ -94,10 +92,10 @@ class MapCorrection:
             self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
 
     def _fits(self, loop: Link) -> bool:
-        """True if the poses of a map agree with a loop."""
+        """True if the poses of a map agree with a loop within its own sigma."""
         poses = self._places.poses
         error = se3.log(se3.inverse(poses[loop.a] @ loop.T_a_b) @ poses[loop.b])
-        return bool(np.linalg.norm(error[:3]) < FITS_M and np.linalg.norm(error[3:]) < FITS_RAD)
+        return bool(error @ np.linalg.solve(loop.covariance, error) < len(error))
 
     def covariance_at(self, T_odom_rect: Array, covariance: Array) -> Array:
         """Return the covariance (6, 6) in the map of a pose whose covariance in odom is given."""

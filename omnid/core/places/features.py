@@ -29,10 +29,6 @@ Signature = NDArray[np.complex64]
 Thumbnail = NDArray[np.int8]
 
 FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
-CORNERS: Final = 450  # detected, as the depth of some is not known; by trial on development seeds
-# Side of a feature, in baselines of the rig: disparity times this is its side in px.
-PATCH_BASELINES: Final = 2.0
-LARGEST_SIDE_PX: Final = 240.0  # at scale 1; by trial on development seeds
 # Samples along a side of a patch, cells along a side, directions of the gradient in each cell; as in SIFT (Lowe 2004).
 SAMPLES, CELLS, BINS = 16, 4, 8
 LARGEST: Final = 0.2  # Limit of a histogram's entries, of one of length 1 (Lowe 2004).
@@ -41,17 +37,16 @@ SCALE: Final = 512.0  # Factor on the square roots of a descriptor's shares, so 
 ROWS, COLUMNS = 16, 128  # of a thumbnail: 2 kB a keyframe, 2.8 degrees a column; by trial on development seeds
 # Columns, rows: window of the mean that is subtracted, because brightness changes with the light.
 SMOOTH: Final = (31, 5)
-LEAST_CONTRAST: Final = 4.0  # grey levels: below it there is nothing to compare.
 THUMBNAIL_SCALE: Final = 30.0  # Root mean square of a thumbnail's values, so that hardly any exceeds a byte.
 
 
 def describe(frame: StereoFrame) -> PlaceFeatures:
     """Return the features of a frame, at most FEATURES, evenly spread, with views in columns of the full turn."""
-    pixels = corners(frame.lower, frame.usable, CORNERS)
+    pixels = corners(frame.lower, frame.usable, 2 * FEATURES)  # as the depth of some is not known
     disparity = nearby_disparity(frame.disparity, pixels)
     located = np.flatnonzero(np.isfinite(disparity))[:FEATURES]
     pixels, disparity = pixels[located], disparity[located]
-    sides = np.clip(PATCH_BASELINES * disparity, SAMPLES, frame.lower.scale * LARGEST_SIDE_PX)
+    sides = np.maximum(2 * disparity, SAMPLES)  # two baselines of the rig
     views = np.column_stack([frame.lower.in_turn(pixels[:, 0]), pixels[:, 1], pixels[:, 1] + disparity])
     return PlaceFeatures(describe_patches(frame.lower, pixels, sides), views.astype(np.float32))
 
@@ -131,17 +126,15 @@ def _cell_weights() -> Floats:
 def thumbnail(panorama: PaddedPanorama) -> Thumbnail:
     """Return the panorama (H, W) at (ROWS, COLUMNS) of a full turn without its slow changes of brightness.
 
-    The root mean square is THUMBNAIL_SCALE; zeros for a panorama without contrast, and outside of a sector.
+    The root mean square is THUMBNAIL_SCALE; zeros outside of a sector.
     """
     columns = max(1, round(COLUMNS * panorama.width / panorama.period_px))
     small = cv2.resize(panorama.panorama, (columns, ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
     pad = SMOOTH[0] // 2
     border = cv2.BORDER_WRAP if columns == COLUMNS else cv2.BORDER_REPLICATE
     contrast = small - cv2.blur(cv2.copyMakeBorder(small, 0, 0, pad, pad, border), SMOOTH)[:, pad:-pad]
-    whole, size = np.zeros((ROWS, COLUMNS), np.float32), float(np.linalg.norm(contrast))
-    if size >= LEAST_CONTRAST * math.sqrt(small.size):
-        first = round(COLUMNS * panorama.first / panorama.period_px)
-        whole[:, (first + np.arange(columns)) % COLUMNS] = contrast / size
+    whole, first = np.zeros((ROWS, COLUMNS), np.float32), round(COLUMNS * panorama.first / panorama.period_px)
+    whole[:, (first + np.arange(columns)) % COLUMNS] = contrast / max(float(np.linalg.norm(contrast)), 1.0)
     return np.asarray(np.clip(np.rint(THUMBNAIL_SCALE * math.sqrt(whole.size) * whole), -127, 127), np.int8)
 
 

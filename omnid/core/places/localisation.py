@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.scan_grid import KeyframeScans
+from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.features import Thumbnail, describe, thumbnail
 from omnid.core.places.place_map import (
     NO_KEYFRAME,
-    NOTHING,
     Link,
     PlaceFeatures,
     PlaceKeyframe,
@@ -29,7 +29,16 @@ from omnid.core.places.place_map import (
     PlaceMap,
     relative_covariance,
 )
-from omnid.core.places.recognition import MIN_MATCHES, Expected, PlaceSearch, Recognition, motion_between
+from omnid.core.places.recognition import (
+    FAR,
+    GATE_M,
+    GATE_RAD,
+    MIN_MATCHES,
+    Expected,
+    PlaceSearch,
+    Recognition,
+    motion_between,
+)
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import MapState
 
@@ -38,18 +47,12 @@ Array = NDArray[np.float64]
 # Set by trial on development seeds, where a line gives no other reason.
 LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometry itself still sees what is that near.
 TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is bounded
-# After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
-CONTRADICTIONS: Final = 10
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
 APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
-SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
-SURE_INLIERS: Final = 24  # Inliers of recognitions that count without motion: a robot may be at rest.
-# Odometry computes dense depth at its own keyframes. Where it makes none, the map waits for this multiple of the
-# distance between its keyframes before it asks for dense depth itself.
-WAIT_FACTOR: Final = 2.0
-JITTER_NS: Final = 5_000_000  # Stamps vary, so a rate that divides that of the cameras is reached with this tolerance.
-SEARCHES: Final = 10  # After this number of searches without success only new keyframes are searched for.
+# Searches in a row: of so many without success, only new keyframes are searched for; of so many that odometry
+# contradicts, it has missed a motion, because right ones in worlds that repeat had 3.
+SEARCHES: Final = 10
 # Covariance in a map of which nothing has been recognised, m^2 and rad^2, because it may be a kilometre away in any
 # direction.
 UNKNOWN_PLACE: Final[Array] = np.diag([1e6] * 3 + [np.pi**2] * 3)
@@ -106,14 +109,17 @@ def agreeing(kept: Iterable[Hypothesis], new: Hypothesis, poses: Mapping[int, Ar
     for one in (*kept, new):
         if one.place.id in poses and one.link.b in poses:
             moved_m, turned_rad = motion_between(one.T_map_odom(poses) @ new.T_odom_rect, T_map_new)
-            if moved_m < SAME_M and turned_rad < SAME_RAD and _is_distinct(one, distinct):
+            if moved_m < GATE_M and turned_rad < GATE_RAD and _is_distinct(one, distinct):
                 distinct.append(one)
     return distinct if len(distinct) >= CONSISTENT else []
 
 
 def _is_distinct(one: Hypothesis, others: list[Hypothesis]) -> bool:
-    """True if a recognition counts besides others: it has many inliers, or its frame is apart from theirs."""
-    if one.place.inliers >= SURE_INLIERS:
+    """True if a recognition counts besides others: it has many inliers, or its frame is apart from theirs.
+
+    Many count without motion, as a robot may be at rest.
+    """
+    if one.place.inliers >= FAR.inliers:
         return True
     moved = (motion_between(one.T_odom_rect, other.T_odom_rect) for other in others)
     return all(moved_m > APART_M or turned_rad > APART_RAD for moved_m, turned_rad in moved)
@@ -128,7 +134,7 @@ class MapLocaliser:
         """places: a map to be extended; None: a new one, which begins where odom does. localize_only: the map stays as
         it is; the newest keyframes of the run tie odom to it, and are no places.
         """
-        self._limits, self._period_ns = limits, 1e9 / limits.rate_hz - JITTER_NS
+        self._limits, self._period_ns = limits, NS_PER_S / limits.rate_hz - STAMP_JITTER_NS
         self.places = places if places is not None else PlaceMap()
         self._localize_only = localize_only
         self._fixed = frozenset(self.places.keyframes if localize_only else ())  # keyframes (ids) that stay
@@ -227,7 +233,7 @@ class MapLocaliser:
         if self._last_T is not None:
             self._path_m += motion_between(self._last_T, frame.T_odom_rect)[0]
         self._last_T = frame.T_odom_rect
-        is_wrong = self.search.contradicted >= CONTRADICTIONS
+        is_wrong = self.search.contradicted >= SEARCHES
         if is_wrong:  # and so are the keyframes since the first contradiction
             for id in [id for id, at_m in self._path_at.items() if at_m > self._confirmed_m]:
                 self.places.drop(id)
@@ -240,7 +246,11 @@ class MapLocaliser:
             self.correction.forget()
 
     def _keyframe_is_due(self, frame: OdometryFrame) -> bool:
-        """True if the view has changed enough since the newest keyframe; sooner for a frame whose depth is known."""
+        """True if the view has changed enough since the newest keyframe.
+
+        Odometry computes dense depth at its own keyframes. Where it makes none, the map waits for twice the distance
+        between its keyframes before it asks for dense depth itself.
+        """
         newest, limits = self._newest, self._limits
         if newest is None:
             return True
@@ -248,7 +258,7 @@ class MapLocaliser:
             return False
         moved_m, turned_rad = motion_between(newest.T_odom_rect, frame.T_odom_rect)
         change = max(moved_m / limits.keyframe_m, turned_rad / math.radians(limits.keyframe_deg))
-        return change >= (1.0 if frame.is_keyframe else WAIT_FACTOR)
+        return change >= (1 if frame.is_keyframe else 2)
 
     def _search_is_due(self, frame: OdometryFrame) -> bool:
         """True for a frame that becomes no keyframe if a recognition is to be checked, or odom's place is not known."""
@@ -295,7 +305,7 @@ class MapLocaliser:
     def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:
         """Add a keyframe to the map."""
         if self._localize_only:
-            features = NOTHING
+            features = features.first(0)
             ties = [id for id in self.places.keyframes if id not in self._fixed]
             for id in ties[: len(ties) - TIES + 1]:
                 self.places.drop(id)

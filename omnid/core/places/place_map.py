@@ -57,10 +57,6 @@ class PlaceFeatures:
         return PlaceFeatures(self.descriptors[:count], self.views[:count])
 
 
-# Features of a frame that shows none; exact.
-NOTHING: Final = PlaceFeatures(np.zeros((0, DESCRIPTOR), np.uint8), np.zeros((0, 3), np.float32))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceKeyframe:
     """Evidence by which a place is recognised; the rectified frame is that of the lower panorama."""

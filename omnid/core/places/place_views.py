@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.mapping.range_scan import MAX_RANGE_M
 from omnid.core.mapping.scan_grid import MAX_CELLS, Grid, KeyframeGrid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
 from omnid.core.places.place_map import PlaceMap, PlaceRig
 from omnid.core.places.pose_graph import connected
+from omnid.core.places.recognition import SIGMA_PX
 from omnid.core.stereo.triangulation import triangulate
 
 Array = NDArray[np.float64]
-
-SIGMA_PX: Final = 0.3  # standard deviation of a disparity; by trial on development seeds
-MAX_SIGMA_M: Final = 0.3  # largest standard deviation of a landmark that is shown; by trial on development seeds
-VOXEL_M: Final = 0.05  # Side of the voxels in which landmarks of several keyframes are fused; as in the grids.
 
 
 def paths_xy(places: PlaceMap, rig: PlaceRig) -> Array:
@@ -51,14 +47,14 @@ def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
     return KeyframeGrid(cell_m, MAX_CELLS).draw(KeyframeScans(scans, free_m, poses), rig.T_base_rect)
 
 
-def landmarks(places: PlaceMap, rig: PlaceRig) -> MapPoints:
-    """Return the landmarks of all keyframes, fused in voxels."""
+def landmarks(places: PlaceMap, rig: PlaceRig, voxel_m: float) -> MapPoints:
+    """Return the landmarks of all keyframes up to MAX_RANGE_M, fused in voxels."""
     count = sum(len(keyframe.features.views) for keyframe in places.keyframes.values())
-    fused = VoxelMap(VOXEL_M, count)
+    fused = VoxelMap(voxel_m, count)
     for id in sorted(places.keyframes):
         points = triangulate(places.keyframes[id].features.views.astype(float), rig.cylinder, rig.baseline_m)
         radius = np.hypot(points[:, 0], points[:, 1])
         sigma_m = SIGMA_PX * radius**2 / (rig.cylinder.focal_px * rig.baseline_m)
-        sure = sigma_m < MAX_SIGMA_M
+        sure = radius < MAX_RANGE_M
         fused.insert(se3.apply(rig.T_base_rect @ places.poses[id], points[sure]), sigma_m[sure] ** 2, id)
     return fused.points(min_frames=1)

@@ -9,7 +9,7 @@ full or not at all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -24,13 +24,9 @@ Indices = NDArray[np.intp]
 
 # Squared Mahalanobis distance of a right loop, because 99 % are below it (chi-squared, 6 dimensions).
 LARGEST_SQUARED: Final = 16.8
-STEEPER: Final = 2.0  # factor of mu from step to step; Yang et al. take 1.4; by trial on development seeds
 MAX_STEPS: Final = 60  # Gauss-Newton steps; enough: 24 for 2,000 nodes, 200 loops.
 # M and rad: a smaller step is the last one, once all weights are 0 or 1, because no map is so exact.
 CONVERGED: Final = 1e-5
-UNDECIDED: Final = 1e-3  # distance of a weight from 0 and 1; by trial on development seeds
-# Weight from which a loop counts as accepted; the middle is enough, because weights end at 0 or 1.
-ACCEPTED: Final = 0.5
 DAMPING: Final = 1e-6  # added to the diagonal, 1/m^2 and 1/rad^2, so that nodes which no edge holds stay where they are
 
 
@@ -57,6 +53,11 @@ class PoseGraphResult:
     # loops join it to one of them.
     covariance: Array
 
+    @property
+    def accepted(self) -> Flags:
+        """Edges (M,) that agree; the middle decides, because weights end at 0 or 1."""
+        return np.asarray(self.weights > 0.5)
+
 
 def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> PoseGraphResult:
     """Return the poses (N, 4, 4) that best explain all edges, from a start.
@@ -77,15 +78,14 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
         change = graph.solve(residual, J, weights)
         poses = poses @ se3.exp(change)
         residual, J = graph.linearised(poses)
-        decided = bool((np.minimum(weights, 1 - weights) < UNDECIDED).all())
-        if decided and float(np.abs(change).max()) < CONVERGED:
+        is_decided = bool(np.isin(weights, (0, 1)).all())
+        if is_decided and float(np.abs(change).max()) < CONVERGED:
             break
-        mu *= STEEPER
-    last = next(
-        part for part in connected(range(len(poses)), edges.pairs[weights > ACCEPTED]) if part[-1] + 1 == len(poses)
-    )
-    covariance = graph.last_covariance(J, weights) if fixed[last].any() else np.full((6, 6), np.inf)
-    return PoseGraphResult(poses, weights, covariance)
+        mu *= 2  # Yang et al. take 1.4
+    result = PoseGraphResult(poses, weights, np.full((6, 6), np.inf))
+    parts = connected(range(len(poses)), edges.pairs[result.accepted])
+    last = next(part for part in parts if part[-1] + 1 == len(poses))
+    return replace(result, covariance=graph.last_covariance(J, weights)) if fixed[last].any() else result
 
 
 class _Graph:

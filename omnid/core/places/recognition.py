@@ -29,20 +29,15 @@ Indices = NDArray[np.intp]
 RATIO: Final = 0.85  # largest distance of a match, as a share of the second best one's (Lowe 2004)
 YAW_WINDOW_RAD: Final = 1.2  # Largest difference between a match's azimuth and the yaw between both views.
 SIGMA_PX: Final = 0.7  # Standard deviation of corners and their disparities.
-THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set
+THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set, and reach of the second search
 MIN_MATCHES: Final = 8  # matches, and inliers among them, below which there is no pose
-REACH_PX: Final = 3.0  # Reach of the second search about the predicted views, because the next brick is not far.
 LARGEST_SQUARED: Final = 0.35 * 512**2  # Squared distance of descriptors that may match in the second search.
 # m, rad: least standard deviations, however many features there are.
 FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
 SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted, of 45 degrees.
-PER_PLACE: Final = 3  # of the compared keyframes lie within NEAR_M of each other, at most
 RUNNER_UP: Final = 0.6  # Share of the inliers with which another place makes a recognition ambiguous.
 RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # Poses farther apart are different places.
-VOTERS: Final = 64  # Features of a frame that vote, evenly spread, the strongest ones first.
-BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
 NEAR_M: Final = 1.5  # Keyframes within this distance of the pose by odometry are searched, besides its error.
-ENOUGH_INLIERS: Final = 50  # Inliers of a place with which the search ends.
 # Largest error of odometry, and its growth with the path [m, m/m; rad, rad/m].
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
@@ -118,7 +113,7 @@ class PlaceSearch:
         not know where they are.
         """
         if isinstance(where, Expected):
-            effort, ids = NEAR._replace(enough=ENOUGH_INLIERS) if where.recognised else NEAR, where.near(places)
+            effort, ids = NEAR._replace(enough=2 * FAR.inliers) if where.recognised else NEAR, where.near(places)
         else:
             effort, ids = FAR, where
         # 1. The most similar thumbnails.
@@ -156,7 +151,7 @@ def search(
     """Return the place that a frame shows, None where none has the support or two have it.
 
     known: features of each keyframe; poses: (4, 4) of each. Those are compared for which most features of the frame
-    vote, at most PER_PLACE near another one, so that a second, similar place is compared as well, although all
+    vote, at most three near another one, so that a second, similar place is compared as well, although all
     neighbours of the first are more similar.
     """
     voted = {id: votes(here, features, model.cylinder.width) for id, features in known.items()}
@@ -165,7 +160,7 @@ def search(
         if len(found) == effort.compared:
             break
         neighbours = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < NEAR_M for other in found)
-        if neighbours >= PER_PLACE:
+        if neighbours >= NEAR.compared:
             continue
         place = found[id] = recognise(here, known[id], id, voted[id][1], model)
         if place is not None and place.inliers >= effort.enough:
@@ -209,8 +204,8 @@ def recognise(
     # 3. The pose by the matches near the views that this one predicts, also those that are similar to others.
     predicted = view(se3.apply(first, points), cylinder, baseline_m).astype(np.float32)
     is_far = squared > LARGEST_SQUARED
-    is_far |= _columns_apart(predicted[:, 0], here.views[:, 0], cylinder.width) > REACH_PX
-    is_far |= (np.abs(here.views[None, :, 1:] - predicted[:, None, 1:]) > REACH_PX).any(axis=2)
+    is_far |= _columns_apart(predicted[:, 0], here.views[:, 0], cylinder.width) > THRESHOLD_PX
+    is_far |= (np.abs(here.views[None, :, 1:] - predicted[:, None, 1:]) > THRESHOLD_PX).any(axis=2)
     a2, b2 = mutual_nearest(np.where(is_far, np.float32(np.inf), squared))
     if len(a2) < MIN_MATCHES:
         return None
@@ -264,17 +259,18 @@ def votes(here: PlaceFeatures, there: PlaceFeatures, width: int) -> tuple[int, f
     """
     if len(there.views) < 2 or not len(here.views):
         return 0, 0.0
-    here = here.first(VOTERS)
+    here = here.first(FEATURES // 3)  # evenly spread, the strongest ones
     squared = distances(here, there)
     best = squared.argmin(axis=1)
     nearest, second = np.partition(squared, 1, axis=1)[:, :2].T
     voting = np.flatnonzero(nearest < RATIO**2 * second)
     # A turn to the left moves the world to the right.
     turned = (here.views[voting, 0] - there.views[best[voting], 0]) % width
-    counts = np.bincount((turned * (BINS / width)).astype(np.intp) % BINS, minlength=BINS)
+    bins = 3 * SECTORS  # of the yaw angle; three neighbours count together
+    counts = np.bincount((turned * (bins / width)).astype(np.intp) % bins, minlength=bins)
     together = counts + np.roll(counts, 1) + np.roll(counts, -1)
     bin = int(together.argmax())
-    return int(together[bin]), (bin + 0.5) * math.tau / BINS
+    return int(together[bin]), (bin + 0.5) * math.tau / bins
 
 
 def motion_between(a: Array, b: Array) -> tuple[float, float]:

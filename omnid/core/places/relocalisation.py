@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
@@ -13,27 +12,24 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import describe
-from omnid.core.places.place_map import PlaceFeatures
-from omnid.core.places.recognition import NEAR, search
+from omnid.core.places.place_map import PlaceFeatures, PlaceLimits
+from omnid.core.places.recognition import FAR, NEAR, search
 from omnid.core.types.stereo_model import StereoModel
-
-MAX_KEYFRAMES: Final = 8  # kept in memory; by trial on development seeds
-KEYFRAMES_APART_M: Final = 0.3  # a keyframe nearer to the last one replaces it; by trial on development seeds
 
 
 class Relocaliser:
-    """Keep at most max_keyframes keyframes, and find the pose of a frame relative to them."""
+    """Keep the newest keyframes, as many as a search compares, and find the pose of a frame relative to them."""
 
-    def __init__(self, model: StereoModel, max_keyframes: int = MAX_KEYFRAMES) -> None:
+    def __init__(self, model: StereoModel) -> None:
         self._model = replace(model, cylinder=model.cylinder.full_turn)  # Columns of features are those of a full turn.
-        self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=max_keyframes)
+        self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=FAR.compared)
         self._features: dict[int, PlaceFeatures] = {}
 
     def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
         """Keep a frame and its keyframe; one near the last keyframe replaces it. It is described when it is needed."""
         if self._kept:
             apart_m = self._kept[-1][1].T_odom_rect[:3, 3] - keyframe.T_odom_rect[:3, 3]
-            if np.linalg.norm(apart_m) < KEYFRAMES_APART_M:
+            if np.linalg.norm(apart_m) < PlaceLimits().keyframe_m:
                 self._kept.pop()
         self._kept.append((frame.packed(), keyframe))
 

@@ -13,7 +13,7 @@ from calib.panorama import Cylinder
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
 from omnid.core.places.place_views import grid, landmarks
-from omnid.core.places.pose_graph import ACCEPTED, PoseEdges, PoseGraphResult, optimise
+from omnid.core.places.pose_graph import PoseEdges, PoseGraphResult, optimise
 from omnid.core.stereo.triangulation import view
 from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of
 
@@ -91,7 +91,7 @@ def places(count: int = 6) -> PlaceMap:
 
 
 def test_landmarks_of_several_keyframes_become_one_in_the_axes_of_the_base() -> None:
-    points = landmarks(places(), RIG)
+    points = landmarks(places(), RIG, 0.05)
     assert len(points.xyz) == 1 and points.frames[0] == 6
     np.testing.assert_allclose(points.xyz, se3.apply(RIG.T_base_rect, LANDMARK), atol=0.01)
 
@@ -191,7 +191,7 @@ def without(edges: PoseEdges, row: int) -> PoseEdges:
 def loops_of(found: PoseGraphResult) -> NDArray[np.bool_]:
     """Return flags of the loops of a run of `laps` that were accepted."""
     odometry_edges = len(found.poses) - 1
-    return found.weights[odometry_edges:] > ACCEPTED
+    return found.accepted[odometry_edges:]
 
 
 @pytest.mark.parametrize("seed", [1, 2])

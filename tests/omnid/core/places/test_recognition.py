@@ -147,9 +147,9 @@ def test_the_pose_beside_a_keyframe_is_found_and_no_other_place_is_taken_for_it(
 
 def test_the_newest_keyframes_are_kept_up_to_the_bound(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     """Blank keyframes push the good one out; one near the last keyframe replaces it."""
-    relocaliser = Relocaliser(cameras.model, max_keyframes=3)
+    relocaliser = Relocaliser(cameras.model)
     _add(relocaliser, frames[0], T_ODOM_KEYFRAME)
-    for k in range(2):
+    for k in range(7):
         _add(relocaliser, cameras.darkness(20 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
         _add(relocaliser, cameras.darkness(30 + k), se3.exp([10.1 + k, 0, 0, 0, 0, 0]))
     assert relocaliser.locate(frames[2]) is not None
