@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -16,6 +18,7 @@ from omnid.core.odometry.earlier_view import EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.stereo.matcher import Matcher
 from omnid.core.stereo.triangulation import triangulate
+from omnid.core.types.panorama import PaddedPanorama
 from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
 from omnid.messages import DensePoints, Panoramas, StereoDepth
@@ -49,31 +52,32 @@ class DenseDepths:
         disparities = min(config.matching.disparities, math.ceil(nearest_px / step_px) * step_px, limit)
         self._matching = replace(config.matching, disparities=disparities)
         self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
-        self._known: WeakKeyDictionary[Panoramas, _Known] = WeakKeyDictionary()
+        self._known: WeakKeyDictionary[Panoramas, tuple[dict[object, DensePoints], Lock]] = WeakKeyDictionary()
         self._one = Lock()
 
     def of(self, depth: StereoDepth) -> DensePoints:
         """Return the dense depth of a pair whose pose is known: points that its earlier view does not contradict."""
-        known, dense = self._of(depth.panoramas), self.points(depth.panoramas, depth.exposure)
-        with known.one:
-            if known.confirmed is None or known.confirmed[0] is not dense or known.confirmed[1] is not depth.earlier:
-                known.confirmed = dense, depth.earlier, self._confirmed(depth, dense)
-            return known.confirmed[2]
+        dense, earlier = self.points(depth.panoramas, depth.exposure), depth.earlier
+        if earlier is None:
+            return dense
+        compute = partial(self._confirmed, depth.panoramas.lower, dense, earlier)
+        return self._once(depth.panoramas, (depth.exposure, earlier), compute)
 
     def points(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
         """Return disparities and their points in the rig frame, as matched, at the stamp of the pair.
 
-        exposure: the motion during the exposures; None: unknown, or none is needed. Of several the last is remembered.
+        exposure: the motion during the exposures; None: unknown, or none is needed.
         """
-        known = self._of(panoramas)
-        with known.one:
-            if known.points is None or known.exposure is not exposure:
-                known.points, known.exposure = self._computed(panoramas, exposure), exposure
-            return known.points
+        return self._once(panoramas, exposure, partial(self._computed, panoramas, exposure))
 
-    def _of(self, panoramas: Panoramas) -> _Known:
+    def _once(self, panoramas: Panoramas, key: object, compute: Callable[[], DensePoints]) -> DensePoints:
+        """Return what was computed of a pair, by what it depends on; others wait meanwhile."""
         with self._one:
-            return self._known.setdefault(panoramas, _Known())
+            known, one = self._known.setdefault(panoramas, ({}, Lock()))
+        with one:
+            if key not in known:
+                known[key] = compute()
+            return known[key]
 
     def _computed(self, panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
         """Return the depth of panoramas, corrected for a motion during their exposures."""
@@ -107,23 +111,11 @@ class DenseDepths:
         pixels = np.column_stack([columns, rows])[kept].astype(float)
         return DensePoints(disparity, pixels, se3.apply(self._T_rig_rect, points), variance_m2)
 
-    def _confirmed(self, depth: StereoDepth, dense: DensePoints) -> DensePoints:
+    def _confirmed(self, lower: PaddedPanorama, dense: DensePoints, earlier: EarlierView) -> DensePoints:
         """Return the dense points of a pair without those that its earlier view contradicts."""
-        if depth.earlier is None:
-            return dense
         points = se3.apply(se3.inverse(self._T_rig_rect), dense.points)
-        wrong = contradicted(depth.panoramas.lower, dense.pixels, points, self._cylinder, depth.earlier)
+        wrong = contradicted(lower, dense.pixels, points, self._cylinder, earlier)
         disparity = dense.disparity.copy()
         columns, rows = dense.pixels[wrong].astype(np.intp).T
         disparity[rows, columns] = np.nan
         return DensePoints(disparity, dense.pixels[~wrong], dense.points[~wrong], dense.variance_m2[~wrong])
-
-
-class _Known:
-    """Depth of a pair that was computed last, and the motion for which it was corrected."""
-
-    def __init__(self) -> None:
-        self.points: DensePoints | None = None
-        self.exposure: Exposure | None = None
-        self.confirmed: tuple[DensePoints, EarlierView | None, DensePoints] | None = None  # as matched, by it, without
-        self.one = Lock()

@@ -84,7 +84,7 @@ class ViewShift:
         return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", J, motion.covariance, J)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
     """Times of exposure of a frame and the motion during it."""
 
