@@ -91,18 +91,21 @@ def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str
 
     verbose: with counts of zero, and those of the map.
     """
+
+    def listed(counts: Mapping[str, int], zeros: bool = True) -> str:
+        return ", ".join(f"{name} {count}" for name, count in counts.items() if count or zeros)
+
     poses, resets, motor = counters.poses, counters.resets, counters.motor
-    states = ((state, count / (poses or 1)) for state, count in counters.states.items() if count or verbose)
     found = {
         "pairs": str(counters.pairs),
         "poses": str(poses),
-        "lost": _listed({name: count for name, count in counters.drops.items() if count or verbose}),
+        "lost": listed(counters.drops, verbose),
         "resets": str(resets) if resets or verbose else "",
-        "map": _listed(counters.map) if verbose else "",
-        "places": _listed(counters.places) if verbose else "",
+        "map": listed(counters.map) if verbose else "",
+        "places": listed(counters.places) if verbose else "",
         "motor": "{commands} commands sent, {errors} errors, {stops} stops".format_map(motor) if motor else "",
         "length": f"{counters.length_m:.4f} m",
-        "states": ", ".join(f"{state} {share:.1%}" for state, share in states),
+        "states": ", ".join(f"{s} {n / (poses or 1):.1%}" for s, n in counters.states.items() if n or verbose),
     }
     return {name: text for name, text in found.items() if text or name == "states"}
 
@@ -122,10 +125,6 @@ def run_summary(counters: RunCounters, timings: Iterable[SummaryRow], *, verbose
 def summary_line(name: str, text: str) -> str:
     """Return an entry of the summary as a line."""
     return f"{name:<9} {text}"
-
-
-def _listed(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
 class Progress:
@@ -151,43 +150,50 @@ class Progress:
 def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
     """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
     stats: dict[str, Any] = pairing.stats()
-    poses, states = statistics.poses, statistics.states
+    poses, states, dark = statistics.poses, statistics.states, statistics.dark
     lost, notable = states[TrackingState.LOST], NOTABLE_SHARE * poses
-    unsure = lost + states[TrackingState.DEGRADED]
-    # 1. Images and their stamps.
-    if stats["_fault"]:
-        yield f"{stats['broken']} images could not be used; the first: {stats['_fault']}"
-    if not stats["pairs"] and not min(stats["unpaired_lower"], stats["unpaired_upper"]):
-        yield "no pair of images: one camera or both have none that can be used, see what was lost below"
-    elif min(stats["unpaired_lower"], stats["unpaired_upper"]) > stats["pairs"]:
-        yield (
+    unsure, unpaired = lost + states[TrackingState.DEGRADED], min(stats["unpaired_lower"], stats["unpaired_upper"])
+    found: list[tuple[object, str]] = [
+        # 1. Images and their stamps.
+        (stats["_fault"], f"{stats['broken']} images could not be used; the first: {stats['_fault']}"),
+        (
+            not stats["pairs"] and not unpaired,
+            "no pair of images: a camera has none that can be used",
+        ),
+        (
+            unpaired > stats["pairs"],
             "most images of both cameras found no partner: their stamps are more than pair.tolerance_ms = "
-            f"{stats['tolerance_ms']:g} apart: correct the clocks of the cameras, synchronise them, or increase it"
-        )
-    for camera in CAMERAS:
-        if (repeated := stats[f"repeated_{camera}"]) >= FROZEN_IMAGES:
-            yield (
-                f"the {camera} camera was frozen: {repeated} of its images had all pixels as before; pairs of such "
-                "images are left out, unless pair.repeated_images = 'use', as for a simulator without noise"
+            f"{stats['tolerance_ms']:g} apart: correct the clocks of the cameras, synchronise them, or increase it",
+        ),
+        *(
+            (
+                stats[f"repeated_{camera}"] >= FROZEN_IMAGES,
+                f"the {camera} camera was frozen: {stats[f'repeated_{camera}']} of its images repeat earlier ones; "
+                "their pairs are left out, unless pair.repeated_images = 'use', as for a simulator without noise",
             )
-    # 2. The rig, the light, dead parts of images.
-    if rig.warning:
-        yield rig.warning
-    if statistics.dark > notable:
-        yield (
-            f"it was too dark in {statistics.dark} of {poses} pairs: the images have more noise than contrast; more "
-            "light, a longer exposure (cameras.exposure_us) or less gain"
-        )
-    for side in SIDES:
-        if (count := statistics.lost_parts[side]) > notable:
-            yield (
-                f"a part of the {side} camera's image was frozen, dark, saturated or blurred in {count} of {poses} "
-                "pairs: it was not used; clean the mirror, check the camera and its driver"
+            for camera in CAMERAS
+        ),
+        # 2. The rig, the light, dead parts of images.
+        (rig.warning, rig.warning),
+        (
+            dark > notable,
+            f"it was too dark in {dark} of {poses} pairs: the images have more noise than contrast; more light, a "
+            "longer exposure (cameras.exposure_us) or less gain",
+        ),
+        *(
+            (
+                statistics.lost_parts[side] > notable,
+                f"a part of the {side} camera's image was frozen, dark, saturated or blurred in "
+                f"{statistics.lost_parts[side]} of {poses} pairs: clean the mirror, check the camera and its driver",
             )
-    # 3. Poses that are not sure.
-    if unsure > poses / 2:
-        yield (
+            for side in SIDES
+        ),
+        # 3. Poses that are not sure.
+        (
+            unsure > poses / 2,
             f"the pose was lost in {lost} of {poses} pairs, degraded in {unsure - lost}: is the rig that of these "
             "cameras, is --lower the lower one, are the images bright and sharp, is the robot slower than "
-            f"odometry.limits.max_speed_mps = {config.odometry.limits.max_speed_mps:g}?"
-        )
+            f"odometry.limits.max_speed_mps = {config.odometry.limits.max_speed_mps:g}?",
+        ),
+    ]
+    return (line for is_so, line in found if is_so)

@@ -104,21 +104,17 @@ class StatusCollector:
         taken_hz, dropped_hz = (
             self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
         )
-        warning = ""
-        if missing:
-            warning = f"no images of the {' and the '.join(missing)} camera"
-        elif broken_hz > 0:
-            warning = f"images cannot be decoded; the first: {stats['_fault']}"
-        elif frozen := stats["_frozen"]:
-            what = f"the images of the {frozen} camera are frozen: all pixels are as before"
-            warning = f"{what}; check the camera and its driver"
-        elif dropped_hz > NOTABLE_SHARE * (taken_hz + dropped_hz):
-            warning = (
-                "too slow: the computer leaves images out; close other programs on it, or start omnid with "
-                "--profile small"
-            )
-        elif pairs_hz == 0:
-            warning = "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them"
+        frozen = stats["_frozen"]
+        warnings = {
+            f"no images of the {' and the '.join(missing)} camera": missing,
+            f"images cannot be decoded; the first: {stats['_fault']}": broken_hz > 0,
+            f"the images of the {frozen} camera are frozen: check the camera and its driver": frozen,
+            "too slow: the computer leaves images out; close other programs, or start omnid with --profile small": (
+                dropped_hz > NOTABLE_SHARE * (taken_hz + dropped_hz)
+            ),
+            "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them": pairs_hz == 0,
+        }
+        warning = next((words for words, is_so in warnings.items() if is_so), "")
         is_corrected = bool(stats["exposure_skew_ms"])
         words = "not synchronised: the motion between the exposures is corrected" if is_corrected else "synchronised"
         return stats | {"_warning": warning, "_words": words}
@@ -155,7 +151,7 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
     is_unwanted = slow or stop not in ("", IDLE, ASKED, COMMAND_STALE, STARTED)
     severity = "_error" if has_failed else "_warning" if is_unwanted else "_words"
     # 2. The numbers.
-    counts = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault")
+    counts = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "obstacle", "problem", "measured", "battery_v")
     arm = "send cmd/arm: `omnid arm`" if state.needs_request else ""
     return {
         **{key: getattr(state, key) for key in counts},
@@ -173,10 +169,6 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         Key.REMEDY: remedy(state.obstacle) if state.blocked else arm,
         "arm_refusal": state.arm_answer.refusal,  # of the newest request to arm; empty: it was accepted
         Key.SOURCE: state.source,
-        "obstacle": state.obstacle,  # why the collision monitor slows down or stops the base
-        "problem": state.problem,  # why the motor controller took no command
-        "measured": state.measured,  # of commands, wheels, gyro and images that differ
-        "battery_v": state.battery_v,
         severity: words,
     }
 
@@ -190,13 +182,7 @@ def stage_stats(stage: StageStats, rate_hz: float = math.nan) -> Stats:
 
 def summary_stats(counters: RunCounters) -> Stats:
     """Return the counters of a finished replay, one number a key."""
-    groups: dict[str, Stats] = {
-        "poses": counters.states,
-        "dropped": counters.drops,
-        "map": counters.map,
-        "places": counters.places,
-        "motor": counters.motor,
-    }
+    groups = {"poses": counters.states, "dropped": counters.drops, "map": counters.map, "places": counters.places}
     return {
         "pairs": counters.pairs,
         "poses": counters.poses,
