@@ -182,7 +182,12 @@ def stage_stats(stage: StageStats, rate_hz: float = math.nan) -> Stats:
 
 def summary_stats(counters: RunCounters) -> Stats:
     """Return the counters of a finished replay, one number a key."""
-    groups = {"poses": counters.states, "dropped": counters.drops, "map": counters.map, "places": counters.places}
+    groups: dict[str, Stats] = {
+        "poses": counters.states,
+        "dropped": counters.drops,
+        "map": counters.map,
+        "places": counters.places,
+    }
     return {
         "pairs": counters.pairs,
         "poses": counters.poses,

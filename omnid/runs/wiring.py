@@ -18,10 +18,9 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
-from omnid.sinks.drive import LiveDrive
+from omnid.sinks.drive import LiveDrive, LockstepDrive
 from omnid.sinks.encoder import Outgoing, StatusReport
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import MapGrid, Mapping
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import CameraFloor, Obstacles

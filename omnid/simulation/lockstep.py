@@ -37,10 +37,9 @@ from omnid.runs.session import run_to_end
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
-from omnid.sinks.drive import NAVIGATION_SENDER
+from omnid.sinks.drive import NAVIGATION_SENDER, controller_pose
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
-from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_scan
 
 Array = NDArray[np.float64]

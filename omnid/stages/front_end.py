@@ -23,7 +23,7 @@ from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.rig_error import RigError
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.relocalisation import Relocaliser
+from omnid.core.places.recognition import Relocaliser
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.dense_depths import DenseDepths

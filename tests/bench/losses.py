@@ -24,7 +24,7 @@ from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
-from omnid.core.places.relocalisation import Relocaliser
+from omnid.core.places.recognition import Relocaliser
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.types.panorama import PaddedPanorama
 from tests.bench.results import Cell, ResultTable, columns, family_and_seed, run

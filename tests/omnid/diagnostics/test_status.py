@@ -27,7 +27,7 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.diagnostics.status import StatusCollector, image_stats, wheel_stats
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
-from omnid.stages.lockstep_drive import controller_pose
+from omnid.sinks.drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport import codec

@@ -15,7 +15,7 @@ from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_hypotheses import MotionHypotheses
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.tracking import KltSettings
-from omnid.core.places.relocalisation import Relocaliser
+from omnid.core.places.recognition import Relocaliser
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import make_rig

@@ -14,7 +14,7 @@ from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
-from omnid.core.places.relocalisation import Relocaliser
+from omnid.core.places.recognition import Relocaliser
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors

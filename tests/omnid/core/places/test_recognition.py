@@ -17,8 +17,7 @@ from omnid.core.places.features import (
     thumbnail,
 )
 from omnid.core.places.place_map import PlaceKeyframe, PlaceMap
-from omnid.core.places.recognition import Expected, PlaceSearch, recognise
-from omnid.core.places.relocalisation import Relocaliser
+from omnid.core.places.recognition import Expected, PlaceSearch, Relocaliser, recognise
 from tests.omnid.core.scenery import RenderedCameras, motion_errors, texture, wrapped
 from tests.simulation import corridor
 from tests.simulation.builders import twin_corridor

@@ -26,7 +26,7 @@ from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.trust import MotorReport, Plausibility, TrustSettings
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
-from omnid.stages.lockstep_drive import LockstepDrive, controller_pose
+from omnid.sinks.drive import LockstepDrive, controller_pose
 from omnid.tracking_state import TrackingState
 from tests.conftest import PAIRS
 
