@@ -113,8 +113,7 @@ class SimulatedCameras:
         self.world, self.samples, self._seed = world, samples, seed
         self.mounted = {"lower": rig.lower, "upper": rig.upper}
         self._sensors = {
-            name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
-            for name, mounted in self.mounted.items()
+            name: MountedSensor(sensor, mounted.visible, mounted.camera.size) for name, mounted in self.mounted.items()
         }
 
     def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers) -> Frame:

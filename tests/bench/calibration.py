@@ -73,7 +73,7 @@ def render_boards(seed: int, amount: float, folder: Path, shape: PrintShape = AS
     for k, T in enumerate(board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)):
         made = {name: one.render_board(T, seed=1000 * seed + k, sensor=SENSOR) for name, one in renderers.items()}
         for name, mounted in sides:
-            jpeg = MountedSensor.of(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
+            jpeg = MountedSensor(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
             (folder / f"{name}_{k:02d}.jpg").write_bytes(jpeg)
     (folder / "rendered").touch()
 

@@ -97,7 +97,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     stamps = START_NS + PERIOD_NS * np.arange(FEW, dtype=np.int64)
     for name, mounted in (("images_bottom", rig.lower), ("images_top", rig.upper)):
         (folder / name).mkdir()
-        sensor, rng = MountedSensor.of(Sensor(), mounted.visible, mounted.camera.size), np.random.default_rng(SEED)
+        sensor, rng = MountedSensor(Sensor(), mounted.visible, mounted.camera.size), np.random.default_rng(SEED)
         for stamp, T in zip(stamps.tolist(), poses, strict=True):
             image = sensor.expose(render_grey(scene, mounted, T, 1), rng)
             cv2.imwrite(str(folder / name / f"{stamp}.png"), image)

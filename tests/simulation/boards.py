@@ -150,7 +150,7 @@ def exposed(
 ) -> BoardImage:
     """Return the image of a scene with a board that has its points (N, 3) [m] at a pose."""
     ideal = render_grey(scene, mounted, np.eye(4), supersample)
-    image = MountedSensor.of(sensor, mounted.visible, mounted.camera.size).expose(ideal, rng)
+    image = MountedSensor(sensor, mounted.visible, mounted.camera.size).expose(ideal, rng)
     return BoardImage(image, mounted.camera.project(se3.apply(T_cam_board, points)), T_cam_board)
 
 

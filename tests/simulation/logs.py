@@ -137,7 +137,7 @@ def write_log(
     if not readout.is_synchronous:
         skews = readout.skew_ns(len(poses)).astype(np.int64)
     sensor = sensor or Sensor()
-    exposures = [MountedSensor.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+    exposures = [MountedSensor(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
     _write_rigs(folder, rig)
 
     def jpeg(pair: int, camera: int) -> bytes:

@@ -34,39 +34,24 @@ class Sensor:
     hub: float = 0.0  # radius
 
 
-def fittings(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
-    """Return the part (H, W) of each pixel that struts and hub hide, 0 to 1; they are fixed to the camera."""
-    if not sensor.hub and not sensor.strut_angles_deg:
-        return np.zeros(size[::-1], np.float32)
-    width, height = size
-    fine = (np.arange(width * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[0]
-    x, y = np.meshgrid(fine, (np.arange(height * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[1])
-    hidden = np.hypot(x, y) <= sensor.hub * width
-    for angle in np.deg2rad(sensor.strut_angles_deg):
-        along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-        hidden |= (along > 0) & (np.abs(across) <= sensor.strut_width * width / 2)
-    return np.asarray(cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
-
-
-def vignetting(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
-    """Return the brightness factor (H, W): 1 in the middle, 1 - vignette at the rim, quadratic in the radius."""
-    x, y = np.meshgrid(np.arange(size[0]) - mask.center[0], np.arange(size[1]) - mask.center[1])
-    rim_px = min(mask.outer_px, size[0] / 2)
-    return np.asarray(1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1), np.float32)
-
-
-@dataclass(frozen=True, slots=True)
 class MountedSensor:
     """One camera's sensor with its fixed patterns, computed once."""
 
-    sensor: Sensor
-    hidden: Floats
-    falloff: Floats
-
-    @staticmethod
-    def of(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> MountedSensor:
-        """Return the exposure of a camera with that mask and image size (width, height)."""
-        return MountedSensor(sensor, fittings(sensor, mask, size), vignetting(sensor, mask, size))
+    def __init__(self, sensor: Sensor, mask: Mask, size: tuple[int, int]) -> None:
+        """mask, size: of the camera, whose images are (width, height)."""
+        self.sensor, (width, height) = sensor, size
+        # 1. The part (H, W) of each pixel that struts and hub hide, 0 to 1; they are fixed to the camera.
+        fine = (np.arange(side * EDGE_STEPS) / EDGE_STEPS - 0.5 + 0.5 / EDGE_STEPS for side in size)
+        x, y = np.meshgrid(*(at - centre for at, centre in zip(fine, mask.center, strict=True)))
+        hidden = np.hypot(x, y) <= sensor.hub * width if sensor.hub else np.zeros(x.shape, bool)
+        for angle in np.deg2rad(sensor.strut_angles_deg):
+            along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+            hidden |= (along > 0) & (np.abs(across) <= sensor.strut_width * width / 2)
+        self.hidden = cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        # 2. The factor (H, W) on the brightness: 1 in the middle, 1 - vignette at the rim, quadratic in the radius.
+        x, y = np.meshgrid(np.arange(width) - mask.center[0], np.arange(height) - mask.center[1])
+        rim_px = min(mask.outer_px, width / 2)
+        self.falloff = (1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1)).astype(np.float32)
 
     def expose(self, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
         """Return the sensor's image (H, W) uint8 of an ideal one."""

@@ -63,7 +63,7 @@ class RenderedCameras:
         maps = remap_tables(rig, rig.lower, cylinder, PAD_PX), remap_tables(rig, rig.upper, cylinder, PAD_PX)
         seen = visible(rig.lower, maps[0], 2) & visible(rig.upper, maps[1], 2)
         seen[:BORDER_PX], seen[-BORDER_PX:] = False, False
-        sensors = [MountedSensor.of(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
+        sensors = [MountedSensor(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
         return RenderedCameras(
             rig,
             scene,

@@ -32,7 +32,6 @@ from tests.replay.command import Command
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
-UNPRIVILEGED = 65534
 IMAGE = StreamFormat("MJPG", 1280, 960, 0, 30.0)
 
 
@@ -104,25 +103,6 @@ def test_checks_the_port_of_the_motor(port: str) -> None:
     group = grp.getgrgid(os.stat(port).st_gid).gr_name
     (found,) = motor(settings)
     assert found.level == "warning" and f"of group {group}" in found.found and 'GROUP="dialout"' in found.advice
-
-
-def as_another_user(script: str) -> list[str]:
-    """Return the lines that a script prints as a user without rights."""
-    text = f"import os, resource; from pathlib import Path\n{script.format(user=UNPRIVILEGED)}"
-    done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
-def test_checks_the_rights_of_this_user() -> None:
-    lines = as_another_user(
-        "from omnid.doctor.checks import rights\n"
-        "for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK): resource.setrlimit(kind, (0, 0))\n"
-        "os.getuid() or os.setuid({user})\n"
-        "print(*rights(20, True), *rights(0, False), sep='\\n')"
-    )
-    assert [line.split()[0] for line in lines] == ["warning", "warning", "ok", "ok"]
-    assert "LimitRTPRIO=20" in lines[0] and "LimitMEMLOCK=infinity" in lines[1]
 
 
 def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
