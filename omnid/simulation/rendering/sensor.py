@@ -47,11 +47,11 @@ class MountedSensor:
         for angle in np.deg2rad(sensor.strut_angles_deg):
             along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
             hidden |= (along > 0) & (np.abs(across) <= sensor.strut_width * width / 2)
-        self.hidden = cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        self.hidden: Floats = np.asarray(cv2.resize(hidden.astype(np.float32), size, interpolation=cv2.INTER_AREA))
         # 2. The factor (H, W) on the brightness: 1 in the middle, 1 - vignette at the rim, quadratic in the radius.
         x, y = np.meshgrid(np.arange(width) - mask.center[0], np.arange(height) - mask.center[1])
         rim_px = min(mask.outer_px, width / 2)
-        self.falloff = (1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1)).astype(np.float32)
+        self.falloff: Floats = (1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1)).astype(np.float32)
 
     def expose(self, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
         """Return the sensor's image (H, W) uint8 of an ideal one."""

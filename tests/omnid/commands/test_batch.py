@@ -104,16 +104,3 @@ def test_a_program_that_is_killed_is_run_again_and_an_interrupted_batch_leaves_n
     assert batch.returncode == 130
     wait_until(lambda: not replays_of(log))
     assert not (out / "log.mcap" / "result.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--set", "no.such=1"), "no.such"),
-        (("--scheduler", "tcp://127.0.0.1:1"), "no dask scheduler answers"),
-        (("--set", "places.map=some.omap"), "extend places.map"),
-    ],
-)
-def test_wrong_options_are_one_line(tmp_path: Path, words: tuple[str, ...], message: str) -> None:
-    code, _, err = omnid("batch", SAMPLE, "--out", tmp_path / "out", *words)
-    assert code == 2 and message in err and len(err.strip().splitlines()) == 1, err

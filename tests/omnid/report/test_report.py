@@ -73,14 +73,6 @@ def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.Capture
     assert "The MIT License" in page.scripts[0], "of uPlot"
 
 
-def test_a_log_of_images_is_refused_with_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log = SAMPLE / "log.mcap"
-    assert main(["report", str(log), "-o", str(tmp_path / "out.html")]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and f"omnid replay {log} --record out.mcap" in error
-    assert not (tmp_path / "out.html").exists()
-
-
 def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
     stage = {"processed": EVIL, "dropped": EVIL, "work_p50_ms": EVIL}
     odometry = {"state": EVIL, "resets": EVIL, "inliers": EVIL, "capture_to_pose_p50_ms": EVIL}
