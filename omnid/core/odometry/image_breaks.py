@@ -175,8 +175,8 @@ class ImageBreaks:
         is_broken = self._torn > DECIDING_COST or bool(self._open)
         is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < DECIDING_COST and not is_broken
         # A pose that was only predicted says too little about the motion between several exposures.
-        is_known = cost is not None or exposure.times.is_at_once
-        if last is not None and dt_s > 0 and is_known and not is_usual:
+        is_known = exposure.times.is_at_once or (cost is not None and exposure.is_known)
+        if last is not None and dt_s > 0 and is_known and last.exposure.is_known and not is_usual:
             flow = self._flow(last, now, local_map)
             found = None if flow is None else likeliest_break(flow, self._raws, self._model.cylinder.focal_px)
         if cost is not None and found is None:
@@ -319,10 +319,10 @@ def _weight(left: Array) -> Array:
 
 def _robust(A: Array, y: Array, weight: Array) -> Array:
     """Return x (K,) that minimises the Geman-McClure cost of y - A x, A (N, 2, K), from weights (N,)."""
-    size = A.shape[2]
-    x: Array = np.zeros(size)
+    x, size = np.zeros(A.shape[2], float), A.shape[2]
     for _ in range(ROUNDS):
         weighted = (weight[:, None, None] * A).reshape(-1, size)
-        x = np.linalg.solve(weighted.T @ A.reshape(-1, size) + RIDGE * np.eye(size), weighted.T @ y.ravel())
+        normal = weighted.T @ A.reshape(-1, size) + RIDGE * np.eye(size)
+        x = np.linalg.solve(normal, weighted.T @ y.ravel()).astype(float)
         weight = _weight(y - A @ x)
     return x
