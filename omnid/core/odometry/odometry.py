@@ -19,7 +19,7 @@ from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
-from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, MotionHypotheses
+from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, OtherMotion
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
@@ -84,8 +84,8 @@ class VisualOdometry:
         self._map = LocalMap(model, klt, limits.keyframes)
         self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser)
         self._search = PoseSearch(self._map, model, limits)
-        self._motion, self._hypotheses, self._tracking = motion or MotionFilter(), MotionHypotheses(), Tracking(limits)
-        self._static_mask = StaticMask(model.cylinder.edges_rad)
+        self._motion, self._other, self._tracking = motion or MotionFilter(), OtherMotion(), Tracking(limits)
+        self._static_mask = StaticMask(model.cylinder)
         self._T_odom_rect = np.eye(4)
         self._T_at_fix = self._T_odom_rect  # the last accepted pose
         self._step: Array | None = None  # last step by the cameras
@@ -156,12 +156,12 @@ class VisualOdometry:
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = _step(now.T_odom_rect, plausible[0].T_odom_rect) if plausible and after_refusal else np.zeros(6)
         if not plausible or np.linalg.norm(gap[:3]) > JUMP_M:
-            self._hypotheses.predict(dt_s)
-            if is_too_fast:
-                self._add_fast(found[0].T_odom_rect, now)
+            self._other.predict(dt_s)
+            if is_too_fast:  # the vehicle may be as fast
+                self._other.replace(now.T_odom_rect, found[0].T_odom_rect, now.since_fix_s)
             is_known = bool(plausible) and plausible[0].inliers >= self._limits.good_inliers
             return self._refuse(now, found, gap if is_known else None)
-        estimate, contradicting = self._hypotheses.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
+        estimate, contradicting = self._other.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(now, estimate, is_reset=bool(np.linalg.norm(gap[3:]) > JUMP_RAD))
@@ -195,20 +195,14 @@ class VisualOdometry:
     def _find(self, now: _Prediction) -> list[PoseEstimate]:
         """Return the pose of a frame in the map, and those of other motions; none: no landmarks were found."""
         if now.is_measured:
-            self._hypotheses.agree()
+            self._other.agree()
         found = self._search.find(now.frame, now.usable, self._T_odom_rect, now.T_odom_rect, now.exposure)
         # After a refused frame the displacements from an unknown place lead anywhere: relocalisation decides.
         if found is None or self._tracking.is_refused:
             return [] if found is None else [found]
-        most_mps = REACH_SIGMAS * now.sigma_mps + float(np.linalg.norm(self._hypotheses.fastest))
+        most_mps = REACH_SIGMAS * now.sigma_mps + float(np.linalg.norm(self._other.velocity))
         reach_m = min(most_mps, self._limits.max_speed_mps) * now.since_fix_s
         return [found, *self._search.others(now.frame, found, now.T_odom_rect, now.exposure, reach_m)]
-
-    def _add_fast(self, T_refused: Array, now: _Prediction) -> None:
-        """Add the motion of a pose that was refused for its speed, since the vehicle may be as fast."""
-        velocity = (T_refused[:3, 3] - self._T_at_fix[:3, 3]) / now.since_fix_s
-        published = self._T_odom_rect[:3, :3] @ self._motion.velocity[:3]
-        self._hypotheses.add(now.T_odom_rect, T_refused, velocity - published)
 
     def _start_again(self, now: _Prediction, found: list[PoseEstimate]) -> list[PoseEstimate]:
         """Start the map again at its first frame, whose velocity this one shows; return the pose in that map."""
@@ -257,7 +251,7 @@ class VisualOdometry:
     def _accept(self, now: _Prediction, estimate: PoseEstimate, *, is_reset: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""
         limits, at_previous = self._limits, None
-        is_sure = self._hypotheses.is_single and self._is_well_supported(estimate)
+        is_sure = not self._other.is_open and self._is_well_supported(estimate)
         if not self._tracking.is_refused and 0 < now.dt_s <= limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             at_previous = self._motion.accept(
@@ -355,10 +349,10 @@ class VisualOdometry:
     def _result(
         self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
     ) -> OdometryEstimate:
-        others_mps = np.pad(self._T_odom_rect[:3, :3].T @ self._hypotheses.fastest, (0, 3))
+        others_mps = np.pad(self._T_odom_rect[:3, :3].T @ self._other.velocity, (0, 3))
         return OdometryEstimate(
             self._T_odom_rect,
-            self._motion.pose_covariance + self._hypotheses.covariance(self._T_odom_rect),
+            self._motion.pose_covariance + self._other.covariance(self._T_odom_rect),
             self._motion.velocity,
             self._motion.velocity_covariance + np.outer(others_mps, others_mps),
             self._tracking.state,

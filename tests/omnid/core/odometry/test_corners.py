@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.types.panorama import PaddedPanorama
@@ -58,7 +59,7 @@ def turn_of(k: int) -> NDArray[np.float64]:
 
 
 def test_a_strut_is_masked_and_the_moving_world_is_not() -> None:
-    mask = StaticMask()
+    mask = StaticMask(Cylinder(480, 120, 60.0))
     for k in range(12):
         mask.observe(behind_strut(k), turn_of(k))
     left = mask.without(ALL)
@@ -73,7 +74,7 @@ def test_bare_walls_are_not_masked() -> None:
     room = np.full((120, 480), 200, np.uint8)
     for column in (30, 170, 330):
         room[40:80, column : column + 40] = texture(3)[40:80, column : column + 40]
-    mask = StaticMask()
+    mask = StaticMask(Cylinder(480, 120, 60.0))
     for k in range(40):
         mask.observe(turned(room, BETWEEN_PX * k), turn_of(k))
     assert mask.without(ALL).mean() > 0.97

@@ -12,7 +12,7 @@ from calib import se3
 from drivers.motion import WheelSample
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
 from omnid.core.odometry.motion_filter import MotionFilter
-from omnid.core.odometry.motion_hypotheses import MotionHypotheses
+from omnid.core.odometry.motion_hypotheses import OtherMotion
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.recognition import Relocaliser
@@ -75,23 +75,27 @@ def pose(x_m: float) -> PoseEstimate:
     return PoseEstimate(T, 1e-6 * np.eye(6), 100, 100, 100, np.arange(100), cost=0.1, in_view=100)
 
 
-def chosen(hypotheses: MotionHypotheses, *candidates: PoseEstimate, sigma_mps: float = 0.1) -> float:
-    """Return where the chosen pose is, 0.1 s after the last one, by a prediction that it has not moved."""
-    found, _ = hypotheses.choose(list(candidates), np.eye(4), PERIOD_S, sigma_mps)
-    return float(found.T_odom_rect[0, 3])
+def test_the_other_motion_goes_on_until_steps_without_its_peak_decide() -> None:
+    """Its displacements add up, and are forgotten where the published motion goes on as predicted."""
+    other = OtherMotion()
 
+    def chosen(*candidates: PoseEstimate) -> float:
+        found, _ = other.choose(list(candidates), np.eye(4), PERIOD_S, 0.1)
+        return float(found.T_odom_rect[0, 3])
 
-def sigma_m(hypotheses: MotionHypotheses) -> float:
-    return float(np.sqrt(hypotheses.covariance(np.eye(4))[0, 0]))
+    def sigma_m() -> float:
+        return float(np.sqrt(other.covariance(np.eye(4))[0, 0]))
 
-
-def test_hypotheses_go_on_at_their_velocities_until_steps_without_another_one_decide() -> None:
-    hypotheses = MotionHypotheses()
     for k in range(1, 4):
-        assert chosen(hypotheses, pose(0.0), pose(0.3), sigma_mps=1.0 if k == 1 else 0.1) == 0.0
-        assert not hypotheses.is_single and sigma_m(hypotheses) == pytest.approx(0.3 * k, rel=0.01)
+        assert chosen(pose(0.0), pose(0.3)) == 0.0
+        assert other.is_open and sigma_m() == pytest.approx(0.3 * k, rel=0.01)
     steps = 0
-    while not hypotheses.is_single:
-        chosen(hypotheses, pose(0.0))
+    while other.is_open:
+        chosen(pose(0.0))
         steps += 1
-    assert 1 < steps < 6 and sigma_m(hypotheses) < 1e-9
+    assert 1 < steps < 6 and sigma_m() < 1e-9
+    # It was the other one: the step is not the predicted one, and what was published stays wrong.
+    chosen(pose(0.0), pose(0.3))
+    for _ in range(5):
+        chosen(pose(0.3))
+    assert not other.is_open and sigma_m() == pytest.approx(0.3, rel=0.01)
