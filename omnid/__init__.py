@@ -21,33 +21,20 @@ from typing import TYPE_CHECKING
 from omnid.version import __version__
 
 if TYPE_CHECKING:
-    from calib.boards.board import Board
-    from omnid.api import Odometry, replay
-    from omnid.calibration.drive import calibrate_drive
-    from omnid.calibration.from_log import calibrate_height, calibrate_mask
-    from omnid.calibration.rig import calibrate_rig
-    from omnid.config import Config, load_config
-    from omnid.errors import OmnidError
-    from omnid.messages import OdometryUpdate
-    from omnid.runs.run_result import RunResult
-    from omnid.tracking_state import TrackingState
+    from calib.boards.board import Board as Board
+    from omnid.api import Odometry as Odometry
+    from omnid.api import replay as replay
+    from omnid.calibration.drive import calibrate_drive as calibrate_drive
+    from omnid.calibration.from_log import calibrate_height as calibrate_height
+    from omnid.calibration.from_log import calibrate_mask as calibrate_mask
+    from omnid.calibration.rig import calibrate_rig as calibrate_rig
+    from omnid.config import Config as Config
+    from omnid.config import load_config as load_config
+    from omnid.errors import OmnidError as OmnidError
+    from omnid.messages import OdometryUpdate as OdometryUpdate
+    from omnid.runs.run_result import RunResult as RunResult
+    from omnid.tracking_state import TrackingState as TrackingState
 
-__all__ = [
-    "Board",
-    "Config",
-    "Odometry",
-    "OdometryUpdate",
-    "OmnidError",
-    "RunResult",
-    "TrackingState",
-    "__version__",
-    "calibrate_drive",
-    "calibrate_height",
-    "calibrate_mask",
-    "calibrate_rig",
-    "load_config",
-    "replay",
-]
 _MODULES = {
     "Board": "calib.boards.board",
     "Config": "omnid.config",
@@ -63,6 +50,7 @@ _MODULES = {
     "load_config": "omnid.config",
     "replay": "omnid.api",
 }
+__all__ = ["__version__", *_MODULES]
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of this package
 

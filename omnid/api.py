@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -31,7 +31,7 @@ from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
 from omnid.settings import dump, parse
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.geometry import geometry
 
 FilePath: TypeAlias = str | PathLike[str]
 GreyImage: TypeAlias = NDArray[np.uint8]  # (H, W)
@@ -96,13 +96,11 @@ class Odometry:
         config: FilePath | Config | None = None,
         *,
         overrides: Sequence[str] = (),
-        mask_images: Iterable[tuple[InputImage, InputImage]] = (),
     ) -> None:
         """Prepare the stages; that takes about a second, and some 20 s where functions are to be compiled.
 
-        rig, config, overrides: as in `replay`. mask_images: pairs (lower, upper), such as the first 60 of a drive, in
-        which the rims of the mirrors are searched if the rig has no masks. A camera without a mask counts as far as
-        its image reaches, which costs accuracy where the image shows more than the mirror.
+        rig, config, overrides: as in `replay`. A camera without a mask counts as far as its image reaches, which costs
+        accuracy where the image shows more than the mirror: calibrate_mask gives a rig the masks that a log shows.
         Raises OmnidError for a rig or a configuration that cannot be used.
         """
         with _user_errors():
@@ -110,11 +108,11 @@ class Odometry:
             settings = _config(config, overrides)
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
-            place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
+            place = geometry(loaded, settings.panorama)
             # `process` gets both images of a pair at once, whatever the time between their exposures.
             together = replace(settings.pair, tolerance_ms=1e3 * MAX_SKEW_S)
             self._front_end = FrontEnd(place, replace(settings, pair=together))
-        self.rig = place.rig  # with the masks that were found
+        self.rig = place.rig
         self._lock = Lock()
         self._seq = 0
         self._stamp_ns: int | None = None
@@ -188,12 +186,6 @@ class Odometry:
                 return np.ascontiguousarray(image)
             found = f"{image.shape} {image.dtype}"
         raise OmnidError(f"{name} image: expected a grey one ({height}, {width}) uint8 as the rig's, found {found}")
-
-    def _frames(self, pairs: Iterable[tuple[InputImage, InputImage]]) -> Iterator[Frame]:
-        for seq, pair in enumerate(pairs):
-            for name, image in zip(CAMERAS, pair, strict=True):
-                grey = self._checked(name, image)
-                yield Frame(seq, seq, name, "mono8", grey, width=grey.shape[1], height=grey.shape[0])
 
 
 def _nanoseconds(name: str, value: int) -> int:

@@ -14,7 +14,7 @@ from importlib import import_module
 from itertools import dropwhile, takewhile
 from operator import methodcaller
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn, cast
 
 from omnid.engine.process import handle_stop_signals
 from omnid.version import __version__
@@ -119,7 +119,6 @@ def _did_you_mean(word: str, known: Sequence[str]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 128 + a signal."""
-    _open_closed_streams()
     bound_image_size()
     limit_blas_threads()
     words = list(sys.argv[1:] if argv is None else argv)
@@ -132,13 +131,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         with suppress(ValueError):  # outside the main thread signals stay as they are
             handlers.enter_context(handle_stop_signals(lambda number, _: os._exit(128 + number)))
         args = parser_of(words).parse_args(words)
-    return _guarded(args)
+        from calib.errors import CalibError
+        from drivers.errors import DriverError
+        from omnid.engine.logging_setup import configure_logging, log
+        from omnid.errors import OmnidError
 
-
-def _open_closed_streams() -> None:
-    """Open stdout and stderr if they were closed, else the next file would get their number and all prints."""
-    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115 - open until the end of the program
-    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115 - open until the end of the program
+    configure_logging()
+    try:
+        code = int(args.command.run(args))
+        sys.stdout.flush()
+        return code
+    except (OmnidError, DriverError, CalibError) as error:
+        log(logging.ERROR, str(error))
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # the reader of the output has gone, such as `head`
+        _discard_stdout()
+        return 141
+    except OSError as error:  # not handled by the command: a full disk, a file name that is too long
+        log(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
+        _discard_stdout()
+        return WRONG_INPUT
 
 
 def bound_image_size() -> None:
@@ -160,18 +174,13 @@ def limit_blas_threads() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-def _leading(words: Sequence[str]) -> list[str]:
-    """Return the words before the options, of which the first ones name the command."""
-    is_option = methodcaller("startswith", "-")
-    return list(takewhile(lambda word: not is_option(word), dropwhile(is_option, words)))
-
-
 def parser_of(words: Sequence[str]) -> Parser:
     """Return the parser of the command that the words name, whose module alone is imported; else of all names."""
     parser = Parser(prog="omnid", description="Odometry, map and guidance from two stacked omnidirectional cameras.")
     parser.add_argument("--version", action="version", version=f"omnid {__version__}")
     parents = {"": parser.add_subparsers(required=True, metavar="command", parser_class=Parser)}
-    leading = _leading(words)
+    is_option = methodcaller("startswith", "-")
+    leading = list(takewhile(lambda word: not is_option(word), dropwhile(is_option, words)))
     named = next((name for name in (" ".join(leading[:2]), *leading[:1]) if name in COMMANDS), None)
     for name in COMMANDS if named is None or _completes() else (named,):
         first, _, second = name.partition(" ")
@@ -194,38 +203,12 @@ def parser_of(words: Sequence[str]) -> Parser:
 def command_at(entry: Entry) -> Command:
     """Import a command."""
     module, _, name = entry.place.partition(":")
-    found: Command = getattr(import_module(f"omnid.commands.{module}"), name or "run")
-    return found
+    return cast("Command", getattr(import_module(f"omnid.commands.{module}"), name or "run"))
 
 
 def _completes() -> bool:
     """True if the shell asks for completions of what is typed (argcomplete)."""
     return "_ARGCOMPLETE" in os.environ
-
-
-def _guarded(args: argparse.Namespace) -> int:
-    from calib.errors import CalibError
-    from drivers.errors import DriverError
-    from omnid.engine.logging_setup import configure_logging, log
-    from omnid.errors import OmnidError
-
-    configure_logging()
-    try:
-        code = int(args.command.run(args))
-        sys.stdout.flush()
-        return code
-    except (OmnidError, DriverError, CalibError) as error:
-        log(logging.ERROR, str(error))
-        return WRONG_INPUT
-    except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:  # the reader of the output has gone, such as `head`
-        _discard_stdout()
-        return 141
-    except OSError as error:  # not handled by the command: a full disk, a file name that is too long
-        log(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
-        _discard_stdout()
-        return WRONG_INPUT
 
 
 def _discard_stdout() -> None:

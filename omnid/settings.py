@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from functools import reduce
 from os import PathLike
-from typing import Any, Final, Literal, TypeVar, get_args, get_origin
+from typing import Any, Final, TypeVar, get_args
 
 from calib.typed_toml import (
     Path,
@@ -23,7 +24,6 @@ from calib.typed_toml import (
     shown,
     table_of,
     types_of,
-    unknown_key,
 )
 from omnid.errors import OmnidError
 
@@ -88,6 +88,13 @@ def dump_minimal(settings: object, wanted: Collection[str]) -> str:
 
 def _change(root: type, text: str) -> tuple[Path, object]:
     """Return the path and the value of an override, which is checked by itself."""
+
+    def check(value: object) -> object:
+        table: dict[str, Any] = {}
+        _insert(table, path, value)
+        convert(root, table)
+        return value
+
     name, equals, raw = text.partition("=")
     path, raw = tuple(part.strip() for part in name.split(".")), raw.strip()
     try:
@@ -95,15 +102,14 @@ def _change(root: type, text: str) -> tuple[Path, object]:
             raise ValueError("expected section.key=value, found no '='")
         if not raw.isprintable() and any("\ud800" <= letter <= "\udfff" for letter in raw):
             raise ValueError(f"{dotted(path)}: expected UTF-8, found {shown(raw)}")
-        value, kind = _scalar(raw), get_args(_type_at(root, path))[0]
-        if (kind is str or get_origin(kind) is Literal) and not isinstance(value, str):
-            value = raw  # a text needs no quotes around it
-        table: dict[str, Any] = {}
-        _insert(table, path, value)
-        convert(root, table)
+        try:
+            return path, check(_scalar(raw))
+        except ValueError as error:
+            with suppress(ValueError):
+                return path, check(raw)  # a text needs no quotes around it
+            raise error
     except (ValueError, OmnidError) as error:
         raise OmnidError(f"override {shown(text)}: {error}") from None
-    return path, value
 
 
 def _scalar(raw: str) -> object:
@@ -113,21 +119,6 @@ def _scalar(raw: str) -> object:
     except ValueError:
         return raw
     return table["value"] if table.keys() == {"value"} else raw
-
-
-def _type_at(root: Any, path: Path) -> Any:
-    """Return the type of the key at a path. Raise ValueError for a path that is none of a key."""
-    kind = root
-    for depth, name in enumerate(path):
-        if not is_section(kind):
-            raise ValueError(f"{dotted(path[:depth])} is a key, not a section: it has no {dotted(path[depth:])}")
-        if name not in types_of(kind):
-            raise unknown_key(root, kind, path[: depth + 1])
-        kind = types_of(kind)[name]
-    if is_section(kind):
-        first = next(key_paths(kind, path))
-        raise ValueError(f"{dotted(path)} is a section: name one of its keys, such as {dotted(first)}")
-    return kind
 
 
 def _insert(table: dict[str, Any], path: Path, value: object) -> None:

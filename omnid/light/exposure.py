@@ -26,7 +26,7 @@ from drivers.cameras.camera_state import (
     ValueRange,
 )
 from drivers.frame import Camera
-from omnid.camera_config import CamerasConfig
+from omnid.config import CamerasConfig
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import FramePair
 

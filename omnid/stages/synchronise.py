@@ -15,7 +15,7 @@ from calib.rig import Rig
 from drivers.errors import FrameDecodeError
 from drivers.frame import CAMERAS, Camera, Frame, coding_steps, gray
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.camera_config import PairConfig
+from omnid.config import PairConfig
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.errors import OmnidError
 from omnid.messages import FramePair

@@ -1,12 +1,13 @@
 """A run drawn in Rerun: a replay as it computes, a recording, or a live robot by its messages; time is the stamp.
 
-Entities: odom (the world) with path, covariance, map, and base_link with obstacles and the points of
+Entities: odom (the world) with path, map, and base_link with obstacles and the points of
 the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, correction;
 state; log. Colours are those of Okabe and Ito, which colour-blind people can distinguish.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any, Final, SupportsFloat, TypeAlias
@@ -36,8 +37,6 @@ TIMELINE: Final = "stamp"
 # Drawn in full at first, then every 2nd, 4th, 8th ... after each further so many.
 MOST: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50}
 MAP_POINTS, RIG_POINTS = 50_000, 3_000
-AXES_M, LEAST_M = 0.3, 0.05  # of the robot's axes; radius from which an ellipsoid is visible
-SIGMAS: Final = 3.0  # radius of the ellipsoid in standard deviations
 # Colours, and sizes on the screen: the radii of lines and points, which do not depend on the distance [px]; of the path
 # by the state: the worse, the thicker.
 BLUE, GREEN, ORANGE, RED = "#56b4e9", "#009e73", "#e69f00", "#d55e00"
@@ -55,12 +54,10 @@ PLOTS: Final = {
 # Topics of a replay that are drawn; the pose in the map is not, because it may come before that in odom.
 REPLAYED: Final = ("odom", "status", "cloud", SCAN)
 LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")  # of Rerun, by the level of a status
-LEGEND: Final = f"""
+LEGEND: Final = """
 **Path**: thin blue tracking, thicker orange degraded, thickest red lost, grey unknown.
 
 **Panorama**: blue dots are inliers, red dots features that do not agree with the pose, yellow dots new landmarks.
-
-**Ellipsoid**: {SIGMAS:g} sigma of the position; its label says by how many times it is magnified.
 
 **Obstacles**: red dots around the base; grey ones mark directions that are unknown.
 
@@ -172,7 +169,7 @@ class RerunSink:
         if self._stream is None:
             self._stream = stream = self._open_stream()
             stream.log("odom", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-            axes = rr.Arrows3D(vectors=AXES_M * np.eye(3), colors=[*map(_rgb, (RED, GREEN, BLUE))], radii=_px(MEDIUM))
+            axes = rr.Arrows3D(vectors=0.5 * np.eye(3), colors=[*map(_rgb, (RED, GREEN, BLUE))], radii=_px(MEDIUM))
             stream.log("odom/base_link", axes, static=True)
             stream.log("legend", rr.TextDocument(LEGEND, media_type="text/markdown"), static=True)
             colours = [_rgb(colour) for colour, _ in STATES.values()]
@@ -194,7 +191,7 @@ class RerunSink:
         self._plot(stamp_ns, plot, "heading mdeg", 1e3 * float(np.rad2deg(heading_rad)))
 
     def _pose(self, pose: Pose) -> None:
-        """Draw the robot, the newest piece of its path and its covariance; plot speeds and landmarks."""
+        """Draw the robot and the newest piece of its path; plot its covariance, speeds and landmarks."""
         if pose.attachment.seq >= 0:
             self._state = pose.state
         self._show_state(pose.stamp_ns)
@@ -208,23 +205,10 @@ class RerunSink:
         piece = np.array([position if self._end is None else self._end, position])
         self._end = position
         stream.log("odom/path", rr.LineStrips3D([piece], **_style(*STATES.get(self._state, STATES["unknown"]))))
-        # 2. The ellipsoid, magnified by a power of ten, at most 1000, so that millimetres are visible.
+        # 2. The plots.
         if np.isfinite(pose.covariance).all():
-            variances, axes = np.linalg.eigh(pose.covariance[:3, :3])
-            radii_m = SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-            axes[:, 2] *= np.sign(np.linalg.det(axes))
-            times = next(times for times in (1, 10, 100, 1000) if times * radii_m.max() >= LEAST_M or times == 1000)
-            shape = rr.Ellipsoids3D(
-                half_sizes=[times * radii_m],
-                centers=[position],
-                quaternions=[rr.Quaternion(xyzw=se3.quaternion(axes))],
-                colors=_rgb(STATES.get(self._state, STATES["unknown"])[0]),
-                labels=[f"{SIGMAS:g} sigma: {1e3 * radii_m.max():.1f} mm, drawn x{times}"],
-                show_labels=False,
-            )
-            stream.log("odom/covariance", shape)
-            self._plot_errors(stamp_ns, "sigma", radii_m.max() / SIGMAS, np.sqrt(max(0.0, pose.covariance[-1, -1])))
-        # 3. The plots.
+            sigma_m = math.sqrt(max(0.0, np.linalg.eigvalsh(pose.covariance[:3, :3])[-1]))
+            self._plot_errors(stamp_ns, "sigma", sigma_m, np.sqrt(max(0.0, pose.covariance[-1, -1])))
         self._plot(stamp_ns, "speed", "m/s", float(np.linalg.norm(pose.velocity[:3])))
         self._plot(stamp_ns, "yaw_rate", "deg/s", float(np.rad2deg(pose.velocity[-1])))
         if pose.attachment.seq >= 0:
@@ -256,7 +240,7 @@ class RerunSink:
         known, unknown = np.isfinite(scan.ranges_m), np.isnan(scan.ranges_m)
         obstacles = scan.ranges_m[known, None] * rays[known]
         stream.log("odom/base_link/obstacles", rr.Points3D(obstacles, **_style(RED, MEDIUM)))
-        stream.log("odom/base_link/unknown", rr.Points3D(AXES_M * rays[unknown], **_style(GREY, THIN)))
+        stream.log("odom/base_link/unknown", rr.Points3D(0.5 * rays[unknown], **_style(GREY, THIN)))
 
 
 class ReplayDrawing:

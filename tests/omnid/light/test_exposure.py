@@ -11,7 +11,7 @@ from calib.panorama import fit_cylinder
 from calib.rig import Rig
 from drivers.cameras.camera_state import CameraExposure, CameraState, ExposureRanges, ExposureSetting, ValueRange
 from drivers.frame import Camera
-from omnid.camera_config import CamerasConfig
+from omnid.config import CamerasConfig
 from omnid.light.exposure import STEP_S, ExposureControl, ExposureLaw, GreyLevels, UsefulArea
 from omnid.messages import FramePair
 from omnid.transport.codec import OK, WARN, DiagnosticStatus

@@ -18,7 +18,7 @@ from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.camera_config import PairConfig
+from omnid.config import PairConfig
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.stages.synchronise import MAX_WAITING, Decoder, MotionInbox, Skew, Synchronise

@@ -14,8 +14,7 @@ import pytest
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
-from omnid.camera_config import PairConfig
-from omnid.config import Config, PanoramaConfig
+from omnid.config import Config, PairConfig, PanoramaConfig
 from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import (
     VIEWS,
