@@ -100,13 +100,20 @@ def web(args: argparse.Namespace) -> int:
       web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml
     """
     require_packages()
-    from omnid.web.server import WebSettings, serve
+    from omnid.web.server import serve
 
     if (args.tls_certificate is None) != (args.tls_key is None):
         raise OmnidError("--tls-certificate and --tls-key belong together: name both")
     config = settings_of(args)
     tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
-    serve(config.bus, WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), tls))
+    serve(
+        config.bus,
+        listen=args.listen,
+        token_file=args.token_file,
+        stop_token_file=args.stop_token_file,
+        names=tuple(args.host),
+        tls=tls,
+    )
     return 0
 
 

@@ -2,33 +2,30 @@
 
 Any site that is open in the same browser may send requests here, or let its own name point to this address (DNS
 rebinding). So a request must name a host of this server, come from a page of this server or from no
-page, and carry a token: as `Authorization: Bearer TOKEN`, or as the cookie that a browser gets for the token.
+page, and carry a token: as `Authorization: Bearer TOKEN`, or as a cookie.
 """
 
 from __future__ import annotations
 
-import hashlib
 import hmac
 import ipaddress
 import os
 import re
 import secrets
 import stat
-from collections.abc import Awaitable, Callable, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from http import HTTPStatus
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from starlette.requests import HTTPConnection
 from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from omnid.errors import OmnidError
 
-# Letters that are not mistaken for others, because a phone's user types them.
-_ALPHABET: Final = "abcdefghjkmnpqrstuvwxyz23456789"
 _TOKEN: Final = re.compile(r"[!-~]{16,256}")
 _HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 _HEADERS: Final = (
@@ -38,27 +35,12 @@ _HEADERS: Final = (
         b"form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
     ),
     (b"x-content-type-options", b"nosniff"),
-    (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"same-origin"),  # with no-referrer browsers hide the origin of the page's own requests
     (b"cross-origin-opener-policy", b"same-origin"),
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cache-control", b"no-store"),
 )
-# Text of the answer to a request that is refused, by the reason.
-REFUSALS: Final = {
-    "unknown host": "this server is not known by that name: start omnid web with --host NAME, or its address",
-    "cross-site": "requests of other sites are refused",
-    "no origin": "a change needs the header Origin of this page, or Authorization: Bearer TOKEN",
-    "no token": "a token is needed: open the address that `omnid web` printed",
-    "wrong token": "the token is not that of this server",
-    "stop only": "this token may see and stop, nothing else",
-}
-
-Scope = MutableMapping[str, Any]
-Message = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Message], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
+NO_TOKEN: Final = "no token: open the address that `omnid web` printed"
 
 
 class Role(StrEnum):
@@ -71,9 +53,11 @@ class Role(StrEnum):
 def token_of(path: Path | None, option: str = "--token-file") -> str:
     """Return the token in a file, which is made if it is missing; without a file a new token. option: its name.
 
+    A new one has no letters that are mistaken for others, because a phone's user types them.
+
     Raise OmnidError for a file that cannot be used, or that every user of this machine may read.
     """
-    made = "-".join("".join(secrets.choice(_ALPHABET) for _ in range(5)) for _ in range(4))
+    made = "-".join("".join(secrets.choice("abcdefghjkmnpqrstuvwxyz23456789") for _ in range(5)) for _ in range(4))
     if path is None:
         return made
     try:
@@ -108,47 +92,46 @@ class Access:
     cookie: str
     stop_token: str = ""
 
-    def role_of(self, given: str, proof: Callable[[str], str] = str) -> Role | None:
-        """Return the role of a token, or of the proof of one; None for any other text, after the same time."""
+    def role_of(self, given: str) -> Role | None:
+        """Return the role of a token; None for any other text, after the same time."""
         found = None
         for role, token in ((Role.STOP, self.stop_token), (Role.DRIVE, self.token)):
-            if hmac.compare_digest(given.strip().encode("utf-8", "replace"), proof(token).encode()) and token:
+            if hmac.compare_digest(given.strip().encode("utf-8", "replace"), token.encode()) and token:
                 found = role
         return found
-
-    def new_cookie(self, role: Role) -> str:
-        """Return the value of the cookie of a browser that knew a token, valid as long as the token."""
-        return _proof(self.token if role is Role.DRIVE else self.stop_token)
 
     def role(self, request: HTTPConnection) -> Role | None:
         """Return what the token or the cookie of a request allows; None without one."""
         if "authorization" in request.headers:
             scheme, _, token = request.headers["authorization"].partition(" ")
             return self.role_of(token) if scheme.lower() == "bearer" else None
-        return self.role_of(request.cookies.get(self.cookie, ""), _proof)
+        return self.role_of(request.cookies.get(self.cookie, ""))
 
     def refusal(self, request: HTTPConnection) -> str:
-        """Return the reason of REFUSALS not to answer a request; "" to answer it."""
+        """Return why a request is not answered; "" to answer it."""
         headers, host, path = request.headers, request.headers.get("host", ""), request.scope["path"]
         reads, has_token = request.scope["method"] in ("GET", "HEAD"), "authorization" in headers
         # 1. DNS rebinding: the name must be one of this server.
         if not self._is_host(host):
-            return "unknown host"
+            return "unknown host: this server is called otherwise; start omnid web with --host NAME, or use its address"
         # 2. Other sites: a page of theirs may only link to the first page, and no site can set Authorization.
+        other_site = "cross-site: requests of other sites are refused"
         own = (f"http://{host.lower()}", f"https://{host.lower()}")
         if headers.get("origin", own[0]).lower() not in own:
-            return "cross-site"
+            return other_site
         if not reads and "origin" not in headers and not has_token:
-            return "no origin"
+            return "no origin: a change needs the header Origin of this page, or Authorization: Bearer TOKEN"
         if is_of_other_site(request) and not (reads and path == "/"):
-            return "cross-site"
+            return other_site
         # 3. The token, except at the address that takes it.
         if path == "/":
             return ""
         role = self.role(request)
         if role is None:
-            return "wrong token" if has_token or self.cookie in request.cookies else "no token"
-        return "stop only" if role is Role.STOP and not reads and path != "/stop" else ""
+            given = has_token or self.cookie in request.cookies
+            return "wrong token: it is not that of this server" if given else NO_TOKEN
+        stop_only = role is Role.STOP and not reads and path != "/stop"
+        return "stop only: this token may see and stop, nothing else" if stop_only else ""
 
     def _is_host(self, host: str) -> bool:
         found = _HOST.fullmatch(host)
@@ -163,14 +146,10 @@ def is_of_other_site(request: HTTPConnection) -> bool:
     return request.headers.get("sec-fetch-site") in ("cross-site", "same-site")
 
 
-def _proof(token: str) -> str:
-    return hmac.new(token.encode(), b"omnid web cookie", hashlib.sha256).hexdigest()
-
-
 class Guard:
     """ASGI middleware: refuses what may not enter, and adds the headers that protect the page."""
 
-    def __init__(self, app: App, access: Access) -> None:
+    def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -183,6 +162,6 @@ class Guard:
 
         app, reason = self._app, self._access.refusal(HTTPConnection(scope))
         if reason:
-            status = HTTPStatus.UNAUTHORIZED if reason.endswith(" token") else HTTPStatus.FORBIDDEN
-            app = PlainTextResponse(f"omnid web: {REFUSALS[reason]}\n", status, {"connection": "close"})
+            status = HTTPStatus.UNAUTHORIZED if " token:" in reason else HTTPStatus.FORBIDDEN
+            app = PlainTextResponse(f"omnid web: {reason}\n", status, {"connection": "close"})
         await app(scope, receive, send_protected)

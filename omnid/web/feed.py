@@ -10,10 +10,10 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import re
 import secrets
 import time
 import zlib
-from bisect import bisect
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
@@ -28,7 +28,7 @@ from calib import se3
 from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.monitor.robot_state import LEVELS, ReceivedMessage, RobotState, importance
-from omnid.plain_text import MOST_CHARACTERS, MOST_ENTRIES, plain
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
 from omnid.transport.status_names import CALIBRATION, MAP_FILE, PLACES, WHEELS, Key, short_name
@@ -40,38 +40,8 @@ OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it as
 NAVIGATION: Final = "navigation"
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
-# Topics whose newest message alone counts, and what stands for each in a new odom.
+# Topics whose newest message alone counts.
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
-_KEPT: Final = ("path", "status", "map")  # Topics whose message from before the connection is asked for.
-
-
-class LivePath:
-    """The path of the robot; a browser is sent the points that it has not seen."""
-
-    def __init__(self) -> None:
-        self._since = 0  # version since which points are only added
-        self._path = ThinnedPath(MOST_POINTS, 0.02)  # a robot at rest adds none
-
-    def add(self, x_m: float, y_m: float, version: int, *, gap: bool = False) -> None:
-        """Add a position, m. version: of the news that it comes with. gap: the robot was put elsewhere."""
-        path, times_thinned = self._path, self._path.thinned
-        path.add(Vertex(x_m, y_m, gap and bool(path.vertices), version))
-        if path.thinned != times_thinned:
-            self._since = version  # all are sent again
-
-    def clear(self, version: int) -> None:
-        """Begin a new path: the robot has started again."""
-        self._path.clear()
-        self._since = version
-
-    def news(self, seen: int) -> dict[str, Any] | None:
-        """Return the points [x, y] added since that version, or all with `from` 0; after a gap [x, y, 1]."""
-        vertices = self._path.vertices
-        begin = bisect(vertices, seen, key=lambda point: point.version) if seen >= self._since else 0
-        if seen >= self._since and begin == len(vertices):
-            return None
-        points = [[point.x_m, point.y_m, *([1] if point.after_gap else [])] for point in vertices[begin:]]
-        return {"from": begin, "points": points}
 
 
 class RobotFeed:
@@ -80,7 +50,8 @@ class RobotFeed:
     def __init__(self, bus: BusConfig) -> None:
         """bus: settings of the connection, which has been checked."""
         self.bus = bus
-        self.state, self.path = RobotState(), LivePath()
+        self.state = RobotState()
+        self.path = ThinnedPath(MOST_POINTS, 0.02)  # of the robot, in odom; a robot at rest adds none
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
         # Of the news: it grows by one each time, from a number of this start, so that pages which were open while this
@@ -94,29 +65,40 @@ class RobotFeed:
         self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
         self._wake = asyncio.Event()
 
-    def news(self, seen: int) -> dict[str, Any]:
-        """Return all that has changed since a version, and the state."""
-        seen = seen if self._start <= seen <= self.version else 0
-        extra = {
-            "panorama_comes": PANORAMA in self._news,
-            "map_in_odom": self._map_in_odom,
-        }
+    def news(self, seen: int, points: int = 0, thinned: int = 0) -> dict[str, Any]:
+        """Return all that has changed since a version, and the state.
+
+        points: of the path, that the page has, after so many times that the path was thinned. Its points are [x, y] in
+        m, after a gap [x, y, 1].
+        """
+        vertices = self.path.vertices
+        if not self._start <= seen <= self.version:  # of another start of this program
+            seen, points = 0, 0
+        if thinned != self.path.thinned or points > len(vertices):
+            points = 0
+        extra = {"panorama_comes": PANORAMA in self._news, "map_in_odom": self._map_in_odom}
         found = {"seen": self.version, "state": state_news(self.bus.robot, self.state, self.link, extra)}
-        if (path := self.path.news(seen)) is not None:
-            found["path"] = path
+        if points < len(vertices):
+            added = [[one.x_m, one.y_m, *([1] if one.after_gap else [])] for one in vertices[points:]]
+            found["path"] = {"from": points, "points": added, "thinned": self.path.thinned}
         return dict(browsable(found | {k: content for k, (version, content) in self._news.items() if version > seen}))
 
     async def live(self, request: Request) -> Response:
-        """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
-        seen = request.query_params.get("seen", "")
-        if not (seen.isascii() and seen.isdigit() and len(seen) < 16):
+        """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it.
+
+        points, thinned: of its path, see `news`.
+        """
+        counts = [request.query_params.get(name, "0") for name in ("points", "thinned")]
+        counts.insert(0, request.query_params.get("seen", ""))
+        if not all(re.fullmatch(r"[0-9]{1,15}", count) for count in counts):
             return _text("the page names the version of the news that it has seen", HTTPStatus.BAD_REQUEST)
         if request.query_params.get("panorama") == "1":
             self._wanted_until_s = time.monotonic() + 4 * QUIET_S
-        if int(seen) == self.version:
+        seen, points, thinned = map(int, counts)
+        if seen == self.version:
             async with self._changed:
                 await self._changed.wait()
-        text = json.dumps(self.news(int(seen)), separators=(",", ":"), allow_nan=False)
+        text = json.dumps(self.news(seen, points, thinned), separators=(",", ":"), allow_nan=False)
         return Response(text, media_type="application/json")
 
     async def image(self, request: Request) -> Response:
@@ -140,7 +122,7 @@ class RobotFeed:
             self._wake.clear()
             self.process_inbox()
             while self._large:
-                await self.take_large(self._large.popitem()[1])
+                await asyncio.to_thread(self.process_large, self._large.popitem()[1])
             async with self._changed:
                 self.version += 1
                 self._changed.notify_all()
@@ -166,10 +148,13 @@ class RobotFeed:
             except Unreachable as error:
                 self.link = str(error)
                 await asyncio.sleep(QUIET_S)
-        for topic in ("path", "odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
-            end = await asyncio.to_thread(self.robot.on_message, receive, topic, kept=topic in _KEPT)
-            if topic == "path":  # which grows by the poses from here on
-                await asyncio.to_thread(end)
+        with await asyncio.to_thread(self.robot.subscribe, PlanarPath) as paths:
+            before = paths.newest()  # which grows by the poses from here on
+        if before is not None and before.frame == PATH_FRAME:
+            for x_m, y_m in before.xy.tolist():
+                self.path.add(Vertex(x_m, y_m))
+        for topic in ("odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
+            await asyncio.to_thread(self.robot.on_message, receive, topic, kept=topic in ("status", "map"))
         self.link = ""
         self.robot.on_alive(self.state.set_alive)
         end_panorama: Callable[[], None] | None = None
@@ -198,38 +183,29 @@ class RobotFeed:
                     self._map_in_odom = map_in_odom(in_map, self.state.recent) or self._map_in_odom
                 case Diagnostics():
                     has_news = True
-                case PlanarPath(frame=frame, xy=xy) if frame == PATH_FRAME:
-                    for x_m, y_m in xy.tolist():
-                        self.path.add(x_m, y_m, self.version + 1)
         if self.state.forget_ended() or has_news:
             self._set("parts", parts_news(self.state))
 
     def _add_to_path(self, pose: Pose, before: Pose | None) -> None:
-        """Add a pose; another run has another odom."""
+        """Add a pose; another run has another odom, for which the pages load again."""
         if before is not None and pose.attachment.run != before.attachment.run:
-            self.path.clear(self.version + 1)
+            self.path.clear()
             self._map_in_odom = None
             self._images.clear()
-            nothing = {
-                "map": {"frame": PATH_FRAME, "width": 0},
-                SCAN: {"points": [], "nearest": None},
-                NAVIGATION: navigation_news(NavigationReport()),
-                PANORAMA: 0,
-            }
-            for kind in nothing.keys() & self._news.keys():
-                self._set(kind, nothing[kind])
+            self._news.clear()
         gap = before is not None and pose.attachment.resets != before.attachment.resets
-        self.path.add(pose.x_m, pose.y_m, self.version + 1, gap=gap)
+        self.path.add(Vertex(pose.x_m, pose.y_m, gap and bool(self.path.vertices)))
 
-    async def take_large(self, message: ReceivedMessage) -> None:
-        """Take a scan, a report of the navigation, a map or a panorama, which are decoded in a thread."""
-        match await asyncio.to_thread(self.state.process, message):
+    def process_large(self, message: ReceivedMessage) -> None:
+        """Process a scan, a report of the navigation, a map or a panorama; in a thread, because that takes time."""
+        match self.state.process(message):
             case Scan() as scan:
-                self._set(SCAN, scan_news(scan, self.state.recent))
+                self._set(SCAN, scan_news(scan, list(self.state.recent)))
             case NavigationReport() as report:
-                self._set(NAVIGATION, navigation_news(report))
+                names = ("state", "reason", "task", "left_m", "teaching", "taught_m", "refusal")
+                self._set(NAVIGATION, {name: getattr(report, name) for name in names})
             case Map() as grid:
-                header, cells = await asyncio.to_thread(map_cells, grid)
+                header, cells = map_cells(grid)
                 encoding = {"content-encoding": "deflate"}
                 self._images["map"] = Response(cells, headers=encoding, media_type="application/octet-stream")
                 self._set("map", {**header, "version": self.version + 1})
@@ -262,6 +238,7 @@ def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any
         "link": link,
         **{name: getattr(state, name) for name in ("alive", "state", "rate_hz", "missed", "broken")},
         "fresh": state.rate_hz > 0,
+        "run": None if state.pose is None else state.pose.attachment.run,
         "pose": None if state.pose is None else _pose(state.pose),
         "age_ms": [1e3 * state.age.p(q) for q in (0.5, 0.99)],
         "wheels": _wheels(state),
@@ -298,17 +275,11 @@ def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float] | None:
 
 def parts_news(state: RobotState) -> list[dict[str, Any]]:
     """Return the status entries of which the page shows the values."""
+    found = [part for name in (CALIBRATION, MAP_FILE) if (part := state.statuses.get(name)) is not None]
+    values = [[list(pair) for pair in islice(part.values.items(), MOST_ENTRIES)] for part in found]
     return [
-        {
-            "name": short_name(part.name),
-            "message": part.message,
-            "values": [
-                [key[:MOST_CHARACTERS], value[:MOST_CHARACTERS]]
-                for key, value in islice(part.values.items(), MOST_ENTRIES)
-            ],
-        }
-        for name in (CALIBRATION, MAP_FILE)
-        if (part := state.statuses.get(name)) is not None
+        {"name": short_name(part.name), "message": part.message, "values": pairs}
+        for part, pairs in zip(found, values, strict=True)
     ]
 
 
@@ -353,12 +324,6 @@ def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
     points = np.column_stack([place.x_m + ranges_m * np.cos(angles), place.y_m + ranges_m * np.sin(angles)])
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
     return {"points": points.tolist(), "nearest": [float(ranges_m[nearest]), turn_deg]}
-
-
-def navigation_news(report: NavigationReport) -> dict[str, Any]:
-    """Return what is driven or taught, and what became of the newest request."""
-    names = ("state", "reason", "task", "left_m", "teaching", "taught_m", "refusal")
-    return {name: getattr(report, name) for name in names}
 
 
 def _pose(pose: Pose) -> dict[str, Any]:

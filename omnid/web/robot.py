@@ -22,13 +22,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
-from omnid.client import Answer, Driver, Robot
+from omnid.client import ANSWER_S, Answer, Driver, Robot
 from omnid.core.control.heading_controller import VelocityLimits
 from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, navigation_verb, route_request
 from omnid.errors import OmnidError
 from omnid.monitor.navigation import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
-from omnid.transport.driver import ANSWER_S
 from omnid.transport.topics import ROUTE, command_of
 from omnid.web.feed import OLDEST_S, RobotFeed, is_recent, server_ms
 
@@ -48,8 +47,8 @@ class RobotPage:
         self._stopping: asyncio.Task[Answer] | None = None
         self._again = False  # a stop was asked for since the newest one was sent
         self._busy: set[str] = set()  # kinds of the requests that wait for an answer, each in a thread
-        self._limits = VelocityLimits()  # those of the robot, read each time that a page takes the stick
-        self._sending = False  # by the stick
+        self._limits: VelocityLimits | None = None  # those of the robot, once a page has taken the stick
+        self._sending: asyncio.Future[None] | None = None  # the newest command of the stick
         self._page, self._held_until_s = "", -math.inf  # the page that drives
         # Sending may block while the robot does not read; no request holds up a stop.
         self._stop_thread, self._stick_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
@@ -88,18 +87,16 @@ class RobotPage:
         return await asyncio.shield(self._stopping)  # a browser that goes does not end it
 
     async def _stop(self) -> Answer:
-        send = partial(stop, self.feed.bus)
+        not_confirmed = "the stop is NOT confirmed: use the emergency stop"
         while self._again:
             self._again = False
             try:
-                stopping = asyncio.get_running_loop().run_in_executor(
-                    self._stop_thread, lambda: send(connection=self.feed.robot)
-                )
-                answer = Answer(True, "the robot stops: its wheels stand until it is armed")
-                if not await stopping:
-                    answer = Answer(False, "the stop is NOT confirmed: use the emergency stop")
+                stopping = partial(stop, self.feed.bus, connection=self.feed.robot)
+                is_stopped = await asyncio.get_running_loop().run_in_executor(self._stop_thread, stopping)
+                words = "the robot stops: its wheels stand until it is armed" if is_stopped else not_confirmed
+                answer = Answer(is_stopped, words)
             except OmnidError as error:
-                answer = Answer(False, f"the stop is NOT confirmed: use the emergency stop. {error}")
+                answer = Answer(False, f"{not_confirmed}. {error}")
         return answer
 
     async def arm(self, request: Request) -> Answer:
@@ -153,12 +150,14 @@ class RobotPage:
 
         STAMP is the server's time in the newest state that the page has shown; PAGE identifies an open page.
         """
-        # 1. Parse the request.
+        # 1. Parse the request, and read the robot's limits once.
         found = _STICK.fullmatch(await text_of(asked))
         forward, turn = (float(found[1]), float(found[2])) if found else (math.inf, math.inf)
         if found is None or max(abs(forward), abs(turn)) > 1.0:
             raise OmnidError('the stick sends "FORWARD TURN STAMP PAGE", the first two from -1 to 1')
-        moves, stamp_ms, page = bool(forward or turn), int(found[3]), found[4]
+        moves, stamp_ms, page, robot = bool(forward or turn), int(found[3]), found[4], self._robot()
+        if (limits := self._limits) is None:
+            limits = self._limits = await asyncio.to_thread(limits_of, robot)
         # 2. Refuse what may not drive now; a release always may.
         if self.is_stopping:
             return Answer(False, "a stop is not confirmed yet: drive after it")
@@ -166,26 +165,15 @@ class RobotPage:
             return Answer(False, "another page drives")
         if moves and not is_recent(stamp_ms):
             return Answer(False, "the network is too slow to drive by it: the stick's request is more than 1 s late")
-        if self._sending:
+        if self._sending is not None and not self._sending.done():
             return Answer(False, "the robot does not take the last command: is it overloaded?")
         # 3. Send it. Other pages are refused until a state would be too old: some requests of this one may be lost.
-        robot, is_held = self._robot(), time.monotonic() < self._held_until_s
         self._page, self._held_until_s = page, time.monotonic() + OLDEST_S
-        self._sending = True
-        try:
-            if not is_held:
-                self._limits = await asyncio.to_thread(limits_of, robot)
-            limits = self._limits
-            # Reading the robot's limits may take so long that the request is no longer recent.
-            if moves and not is_recent(stamp_ms):
-                return Answer(False, "the stick is ready now")
-            velocity_mps = FIRST_SHARE * forward * limits.velocity_mps
-            rate_radps = FIRST_SHARE * turn * limits.yaw_rate_radps
-            send = partial(robot.driver().twist, velocity_mps, rate_radps)
-            sending = asyncio.get_running_loop().run_in_executor(self._stick_thread, send)
-            await asyncio.wait([sending], timeout=ANSWER_S / 2)  # a robot that does not read is not waited for
-        finally:
-            self._sending = False
+        velocity_mps = FIRST_SHARE * forward * limits.velocity_mps
+        rate_radps = FIRST_SHARE * turn * limits.yaw_rate_radps
+        send = partial(robot.driver().twist, velocity_mps, rate_radps)
+        self._sending = asyncio.get_running_loop().run_in_executor(self._stick_thread, send)
+        await asyncio.wait([self._sending], timeout=ANSWER_S / 2)  # a robot that does not read is not waited for
         if not moves:
             return Answer(True, "the stick is released: it stands")
         return Answer(True, f"it drives by the stick: {velocity_mps:+.2f} m/s, {math.degrees(rate_radps):+.0f}°/s")
@@ -217,14 +205,10 @@ def stamp_of(text: str) -> int:
 
 
 async def text_of(request: Request) -> str:
-    """Return the body of a request. Raise OmnidError above LONGEST_BODY bytes, or after ANSWER_S."""
+    """Return the body of a request. Raise OmnidError above LONGEST_BODY bytes."""
     body = bytearray()
-    try:
-        async with asyncio.timeout(ANSWER_S):
-            async for chunk in request.stream():
-                body += chunk
-                if len(body) > LONGEST_BODY:
-                    raise OmnidError(f"a request of at most {LONGEST_BODY} bytes was expected")
-    except TimeoutError:
-        raise OmnidError("the request did not come") from None
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > LONGEST_BODY:
+            raise OmnidError(f"a request of at most {LONGEST_BODY} bytes was expected")
     return body.decode("utf-8", "replace")

@@ -5,20 +5,20 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
-import os
 import re
-import signal
 import socket
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 import uvicorn
-from prometheus_client import CONTENT_TYPE_LATEST
+from prometheus_client import CONTENT_TYPE_LATEST, Metric, generate_latest
+from prometheus_client.core import CounterMetricFamily as Counter
+from prometheus_client.core import GaugeMetricFamily as Gauge
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
@@ -26,69 +26,73 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from omnid.engine.logging_setup import is_journal, log
+from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
+from omnid.monitor.robot_state import RobotState
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.bus_config import BusConfig
-from omnid.web.access import REFUSALS, Access, Guard, is_of_other_site, token_of
+from omnid.transport.status_names import number, short_name
+from omnid.web.access import NO_TOKEN, Access, Guard, is_of_other_site, token_of
 from omnid.web.feed import RobotFeed
-from omnid.web.metrics import metrics
 from omnid.web.robot import RobotPage
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 STATIC: Final = Path(__file__).with_name("static")
 COOKIE_S: Final = 30 * 86_400  # A browser keeps the cookie for this time.
-END_S: Final = 2  # Time that browsers have to finish at the end.
 # A link of another site brings no cookie along (SameSite=Strict); a page that loads itself again does.
 _AGAIN: Final = '<!DOCTYPE html><title>omnid</title><meta http-equiv="refresh" content="0">'
 _LISTEN: Final = re.compile(r"(\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9._-]+):(\d{1,5})")
 _ELSEWHERE: Final = "192.0.2.1"  # an address of documentation (RFC 5737); nothing is sent there
 
 
-@dataclass(frozen=True, slots=True)
-class WebSettings:
-    """Settings of the server."""
+def serve(
+    bus: BusConfig,
+    *,
+    listen: str,
+    token_file: Path | None = None,
+    stop_token_file: Path | None = None,
+    names: tuple[str, ...] = (),
+    tls: tuple[Path, Path] | None = None,
+) -> None:
+    """Serve the page until SIGINT or SIGTERM. Raise OmnidError for settings that cannot be used.
 
-    listen: str = DEFAULT_LISTEN  # HOST:PORT; port 0: any
-    token_file: Path | None = None
-    stop_token_file: Path | None = None  # file of a second token, which may see and stop but not arm
-    names: tuple[str, ...] = ()  # further names of this machine
-    tls: tuple[Path, Path] | None = None  # certificate and key, PEM
-
-
-def serve(bus: BusConfig, settings: WebSettings) -> None:
-    """Serve the page until SIGINT or SIGTERM. Raise OmnidError for settings that cannot be used."""
+    listen: HOST:PORT; port 0: any. stop_token_file: of a second token, which may see and stop but not arm. names:
+    further names of this machine. tls: certificate and key, PEM.
+    """
     # 1. Read the tokens.
-    token = token_of(settings.token_file)
-    stop_token = token_of(settings.stop_token_file, "--stop-token-file") if settings.stop_token_file else ""
+    token = token_of(token_file)
+    stop_token = token_of(stop_token_file, "--stop-token-file") if stop_token_file else ""
     if token == stop_token:
         raise OmnidError("--stop-token-file has the token of --token-file, which may arm: name another file")
-    if settings.token_file is None and is_journal(sys.stdout):
+    if token_file is None and is_journal(sys.stdout):
         raise OmnidError("omnid web prints its token, and the journal would keep it: name a --token-file")
-    with _listening(settings.listen) as listener:
+    with _listening(listen) as listener:
         # 2. Build the page.
         host, port = listener.getsockname()[:2]
         local = ipaddress.ip_address(host).is_loopback
         name = socket.gethostname()
         own = ("localhost", "127.0.0.1", "[::1]") if local else ("localhost", name, f"{name}.local")
-        hosts = frozenset(name.lower() for name in (*own, *settings.names))
+        hosts = frozenset(name.lower() for name in (*own, *names))
         access = Access(token, hosts, not local, f"omnid_{port}", stop_token)
         page = RobotPage(RobotFeed(bus))
-        server = _Server(_uvicorn_config(site(page, access, secure=settings.tls is not None), settings))
+        server = uvicorn.Server(_uvicorn_config(site(page, access, secure=tls is not None), tls))
         # 3. Print where it is; with the tokens, unless the journal would keep them.
-        url = f"{'https' if settings.tls else 'http'}://{_address(host)}:{port}/"
+        url = f"{'https' if tls else 'http'}://{_address(host)}:{port}/"
         if is_journal(sys.stdout):
             print(f"{url} (the token is in the file of --token-file)", flush=True)
         else:
             print(f"{url}?token={token}", flush=True)
             if stop_token:
                 print(f"{url}?token={stop_token} (may see and stop, not arm)", flush=True)
-        if not local and settings.tls is None:
+        if not local and tls is None:
             log(
                 logging.WARNING,
                 "the page can be reached from the network without encryption: everyone who can listen there learns the "
                 "token, and may arm the robot; use --tls-certificate and --tls-key, or a network that you trust",
             )
-        # 4. Serve.
-        asyncio.run(_run(server, page.feed, listener))
+        # 4. Serve. uvicorn ends by a signal, and sends it once more to the handlers of before.
+        with handle_stop_signals(lambda *_: None):
+            asyncio.run(_run(server, page.feed, listener))
 
 
 def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
@@ -96,16 +100,16 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
 
     async def index(request: Request) -> Response:
         """Return the page; let a browser in that names the token."""
-        if (token := request.query_params.get("token")) is not None and (role := access.role_of(token)) is not None:
+        token = request.query_params.get("token")
+        if token is not None and access.role_of(token) is not None:
             response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
-            value = access.new_cookie(role)
-            response.set_cookie(access.cookie, value, COOKIE_S, httponly=True, samesite="strict", secure=secure)
+            response.set_cookie(access.cookie, token, COOKIE_S, httponly=True, samesite="strict", secure=secure)
             return response
         if token is None and access.role(request) is not None:
             return FileResponse(STATIC / "index.html")
         if token is None and is_of_other_site(request):
             return HTMLResponse(_AGAIN)
-        return PlainTextResponse(f"omnid web: {REFUSALS['no token']}\n", HTTPStatus.UNAUTHORIZED)
+        return PlainTextResponse(f"omnid web: {NO_TOKEN}\n", HTTPStatus.UNAUTHORIZED)
 
     async def numbers(_: Request) -> Response:
         return PlainTextResponse(metrics(page.feed.state), media_type=CONTENT_TYPE_LATEST)
@@ -118,37 +122,52 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
     return Guard(Starlette(routes=[*outer, *page.routes()]), access)
 
 
-class _Server(uvicorn.Server):
-    """A server whose signals are handled by its caller."""
-
-    def capture_signals(self) -> Any:
-        """Leave the signals alone."""
-        return nullcontext()
+def metrics(state: RobotState) -> bytes:
+    """Return the metrics for Prometheus: whether the robot is there, its poses, and every number of its status."""
+    registry: Any = SimpleNamespace(collect=lambda: _of_robot(state))
+    return generate_latest(registry)
 
 
-async def _run(server: _Server, feed: RobotFeed, listener: socket.socket) -> None:
+def _of_robot(state: RobotState) -> Iterator[Metric]:
+    yield Gauge("omnid_up", "1 if the daemon's token is on the bus", float(state.alive is True))
+    yield Gauge("omnid_pose_rate_hz", "Poses received per second", state.rate_hz)
+    yield Counter("omnid_poses", "Poses received", state.poses)
+    yield Counter("omnid_poses_missed", "Skipped sequence numbers", state.missed)
+    parts = list(state.statuses.values())
+    levels = (((part.name,), part.level) for part in parts)
+    yield _labelled("omnid_status_level", "0 good, 1 warning, 2 error, 3 stale", ["part"], levels)
+    values = (
+        ((part.name, key), value)
+        for part in parts
+        for key, text in list(part.values.items())[:MOST_ENTRIES]
+        if (value := number(text)) is not None
+    )
+    yield _labelled("omnid_status_value", "Numbers of the status", ["part", "key"], values)
+
+
+def _labelled(name: str, text: str, labels: Sequence[str], samples: Iterable[tuple[tuple[str, ...], float]]) -> Metric:
+    """Return a metric with a sample for each set of labels; those that come again are left out."""
+    found: dict[tuple[str, ...], float] = {}
+    for given, value in samples:
+        found.setdefault(tuple(plain(short_name(label)) for label in given), value)
+    metric = Gauge(name, text, labels=labels)
+    for given, value in found.items():
+        metric.add_metric(given, value)
+    return metric
+
+
+async def _run(server: uvicorn.Server, feed: RobotFeed, listener: socket.socket) -> None:
     """Serve until a signal, or until following the robot fails."""
-
-    def end() -> None:
-        server.should_exit = True
-
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            loop.add_signal_handler(number, end)
     following = asyncio.create_task(feed.run())
-    following.add_done_callback(lambda _: end())
+    following.add_done_callback(lambda _: setattr(server, "should_exit", True))
     await server.serve([listener])
     following.cancel()
     with suppress(asyncio.CancelledError):
         await following
 
 
-def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
-    certificate, key = settings.tls or (None, None)
-    for option, path in (("--tls-certificate", certificate), ("--tls-key", key)):
-        if path is not None and not os.access(path, os.R_OK):
-            raise OmnidError(f"{option} {path}: cannot be read; name a PEM file")
+def _uvicorn_config(guard: Guard, tls: tuple[Path, Path] | None) -> uvicorn.Config:
+    certificate, key = tls or (None, None)
     config = uvicorn.Config(
         guard,
         loop="asyncio",
@@ -160,16 +179,15 @@ def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
         access_log=False,
         proxy_headers=False,
         server_header=False,
-        timeout_graceful_shutdown=END_S,
+        timeout_graceful_shutdown=1,
         ssl_certfile=certificate,
         ssl_keyfile=key,
     )
     try:
         config.load()
     except OSError as error:  # of ssl
-        raise OmnidError(
-            f"--tls-certificate {certificate}: {error.strerror or error}; name a certificate and its key in PEM"
-        ) from error
+        what = f"--tls-certificate {certificate}, --tls-key {key}: {error.strerror or error}"
+        raise OmnidError(f"{what}; name a certificate and its key in PEM") from error
     return config
 
 

@@ -15,7 +15,6 @@ class Vertex(NamedTuple):
     x_m: float
     y_m: float
     after_gap: bool = False  # the robot was put elsewhere before it
-    version: int = 0  # number that its user gives it
 
 
 class ThinnedPath:

@@ -17,6 +17,7 @@ const plan = new Plan(byId("plan"));
 const goal = wireGoal(plan);
 const routes = wireRoutes();
 const shownByState = [wireCommands(), wireStick(), goal, routes];
+let run = null; // of the robot's daemon: another one has another odom, map and path
 let nearest = null; // distance in m and direction in degrees of the nearest obstacle
 
 // Each request names the newest news that are shown, and is answered when there are others: so old ones never queue up.
@@ -28,7 +29,9 @@ async function follow() {
     try {
       // The panorama comes while it is open and the page is seen: it takes bandwidth that the robot may need.
       const panorama = byId("panorama-box").open && !document.hidden ? 1 : 0;
-      const response = await fetch(`live?seen=${seen}&panorama=${panorama}`, { signal: AbortSignal.timeout(GONE_MS) });
+      const path = `points=${plan.points.length}&thinned=${plan.thinned}`;
+      const address = `live?seen=${seen}&${path}&panorama=${panorama}`;
+      const response = await fetch(address, { signal: AbortSignal.timeout(GONE_MS) });
       if (!response.ok) throw new Error(await response.text());
       const news = await response.json();
       await show(news);
@@ -45,7 +48,7 @@ async function follow() {
 }
 
 async function show(news) {
-  if (news.path) plan.addPath(news.path.from, news.path.points);
+  if (news.path) plan.addPath(news.path);
   if (news.scan) {
     nearest = news.scan.nearest;
     plan.setObstacles(news.scan.points);
@@ -80,6 +83,8 @@ function showConnection(text) {
 }
 
 function showState(state) {
+  if (run !== null && state.run !== null && state.run !== run) location.reload();
+  run = state.run ?? run;
   document.title = `${state.robot}: ${state.state}`;
   byId("robot").textContent = state.robot;
   setBadge("state", state.state, state.fresh ? STATES[state.state] ?? "warn" : "bad");
@@ -152,11 +157,11 @@ function direction(degrees) {
   return `${turn}° to the ${degrees > 0 ? "left" : "right"}`;
 }
 
-// version: 0 where the robot has started again, and sent none yet. One that comes while the last one loads is left out.
+// One that comes while the last one loads is left out.
 function showPanorama(version) {
   const image = byId("panorama");
-  image.hidden = version === 0;
-  if (version && image.complete) image.src = `image/panorama?${version}`;
+  image.hidden = false;
+  if (image.complete) image.src = `image/panorama?${version}`;
 }
 
 function setBadge(id, text, className) {

@@ -14,7 +14,7 @@ export class Plan {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
-    Object.assign(this, { points: [], obstacles: [], pose: null, fresh: false, map: null, mapInOdom: null, fits: true });
+    Object.assign(this, { points: [], thinned: 0, obstacles: [], pose: null, fresh: false, map: null, mapInOdom: null, fits: true });
     this.goal = null; // {x, y, yaw}: where it is to drive; yaw null: as it comes
     this.onPick = null; // takes a goal that a finger points out, while one is looked for; null: fingers move the plan
     this.onFit = () => {};
@@ -35,10 +35,12 @@ export class Plan {
     }, { passive: false });
   }
 
-  // Points [x, y] from a position of the list on; a third number marks a gap before the point.
-  addPath(from, points) {
+  // Points [x, y] from a position of the list on; a third number marks a gap before the point. thinned: how often the
+  // server has dropped every second point.
+  addPath({ from, points, thinned }) {
     if (from > this.points.length) return;
     this.points.length = from;
+    this.thinned = thinned;
     for (const point of points) this.points.push(point);
     this.draw();
   }

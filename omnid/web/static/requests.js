@@ -89,7 +89,7 @@ export function wireGoal(plan) {
       if (before && !busy && !choosing) {
         plan.setGoal(null);
         const why = report.reason ? `: ${report.reason}` : "";
-        say(report.state ? `It has ended: ${report.state}${why}.` : "The robot has started again.");
+        say(`It has ended: ${report.state}${why}.`);
       }
       showButtons();
     },
@@ -133,7 +133,7 @@ export function wireRoutes() {
     },
     showNavigation(newest) {
       report = newest;
-      byId("navigation-box").hidden = !report.state; // without one the robot has started again, and reported none yet
+      byId("navigation-box").hidden = false;
       const left = report.left_m === null ? "" : `, ${fixed(report.left_m, 1)} m left`;
       const what = report.task ? `${report.task}: ` : "";
       const why = report.reason ? `: ${report.reason}` : "";

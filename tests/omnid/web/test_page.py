@@ -70,7 +70,7 @@ class Navigator:
         """Report the navigation, and that it is armed."""
         wheels = DiagnosticStatus(WHEELS, 0, "driving", {Key.ARMED: "1"})
         self._bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [wheels]))
-        values = {Key.STATE: self.state, Key.REASON: "", Key.TASK: "route dock", Key.LEFT_M: "3.5"}
+        values = {Key.STATE: self.state, "reason": "", "task": "route dock", "left_m": "3.5"}
         entry = DiagnosticStatus(NAVIGATION, 0, "", {str(key): value for key, value in values.items()})
         self._bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
 

@@ -22,6 +22,7 @@ from prometheus_client import parser
 
 from calib import se3
 from drivers.frame import Frame
+from omnid.core.mapping.thinned_path import Vertex
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
@@ -37,9 +38,8 @@ from omnid.transport.codec import (
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
 from omnid.transport.topics import Answer, Request, command_topics
-from omnid.web.feed import MOST_POINTS, LivePath, RobotFeed, scan_news, state_news
-from omnid.web.metrics import metrics
-from omnid.web.server import STATIC
+from omnid.web.feed import MOST_POINTS, RobotFeed, scan_news, state_news
+from omnid.web.server import STATIC, metrics
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 
 pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
@@ -47,9 +47,7 @@ from starlette.requests import Request as WebRequest
 from starlette.routing import Route
 
 from omnid.client import Robot
-from omnid.core.control.heading_controller import VelocityLimits
-from omnid.monitor.navigation import stop
-from omnid.monitor.teleop import FIRST_SHARE, limits_of
+from omnid.monitor.teleop import FIRST_SHARE
 from omnid.web import feed, robot
 from omnid.web.robot import RobotPage
 from tests.waiting import wait_until
@@ -98,7 +96,7 @@ def rover() -> Iterator[Rover]:
 def page(rover: Rover) -> Iterator[RobotPage]:
     """A page that is connected to the robot."""
     feed = rover.feed()
-    with Robot(settings=feed.bus, timeout_s=30.0) as connection:
+    with Robot(settings=feed.bus) as connection:
         feed.robot, feed.link = connection, ""
         wait_until(lambda: connection.driver().connected)
         yield RobotPage(feed)
@@ -143,20 +141,10 @@ async def until(condition: Callable[[], bool]) -> None:
     await asyncio.to_thread(wait_until, condition, pause_s=0.002)
 
 
-def test_a_stop_ends_once_it_is_confirmed_and_one_asked_for_meanwhile_is_sent_again(
-    rover: Rover, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rounds = list[object]()
-
-    def counted(bus: BusConfig, connection: Robot | None = None) -> bool:
-        rounds.append(connection)
-        return stop(bus, connection=connection)
-
-    monkeypatch.setattr(robot, "stop", counted)
+def test_a_stop_ends_once_it_is_confirmed_whoever_asks_for_it(rover: Rover) -> None:
     wheels = RobotPage(rover.feed())
 
     async def stops() -> list[Answer]:
-        assert not wheels.is_stopping
         first = asyncio.create_task(wheels.stop())
         await until(lambda: "cmd/stop" in rover.topics)
         assert wheels.is_stopping and not first.done()
@@ -166,36 +154,18 @@ def test_a_stop_ends_once_it_is_confirmed_and_one_asked_for_meanwhile_is_sent_ag
         gone.cancel()  # a browser that goes
         rover.is_stopped = True
         answers = await asyncio.gather(first, *others)
-        assert not wheels.is_stopping and len(rounds) == 2, rounds
-        answers.append(await wheels.stop())  # later, it is sent once more
-        assert len(rounds) == 3
+        assert not wheels.is_stopping
         return answers
 
-    expected = Answer(True, "the robot stops: its wheels stand until it is armed")
-    assert asyncio.run(stops()) == [expected] * 4
+    assert asyncio.run(stops()) == [Answer(True, "the robot stops: its wheels stand until it is armed")] * 3
 
 
-def test_the_stick_sends_a_share_of_the_limits(
-    rover: Rover, page: RobotPage, clock_ms: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reads, takes_ms, limits = list[bool](), [0], VelocityLimits(velocity_mps=0.7, yaw_rate_radps=1.5)
-    mps, radps = FIRST_SHARE * limits.velocity_mps, FIRST_SHARE * limits.yaw_rate_radps
-
-    def slow_limits_of(connection: Robot) -> VelocityLimits:
-        reads.append(page._sending)
-        clock_ms[0] += takes_ms[0]
-        return limits_of(connection)
-
-    monkeypatch.setattr(robot, "limits_of", slow_limits_of)
+def test_the_stick_sends_a_share_of_the_limits(rover: Rover, page: RobotPage, clock_ms: list[int]) -> None:
+    mps, radps = FIRST_SHARE * 0.7, FIRST_SHARE * 1.5
 
     def answer(forward: float, turn: float, name: str = "a", late_ms: int = 0) -> Answer:
         return post(page, "/drive", f"{forward:g} {turn:g} {clock_ms[0] - late_ms} {name}")
 
-    # 1. The request for which the limits were read so long that it is late moves nothing; it is the page that drives.
-    takes_ms[0] = 1001
-    assert answer(1, 0) == Answer(False, "the stick is ready now") and not rover.twists
-    assert reads == [True], "no other command is sent while it waits"
-    # 2. Each further one is sent.
     for forward, turn, words in (
         (1.0, -0.5, f"it drives by the stick: {mps:+.2f} m/s, {-28.6479 * radps:+.0f}°/s"),
         (-0.25, 0.0, f"it drives by the stick: {-0.25 * mps:+.2f} m/s, +0°/s"),
@@ -205,14 +175,14 @@ def test_the_stick_sends_a_share_of_the_limits(
         assert answer(forward, turn) == Answer(True, words)
         wait_until(partial(rover.has_more_than, count))
         assert rover.twists[count:] == [pytest.approx((forward * mps, turn * radps))]
-    assert len(reads) == 1, "the limits are read once while a page holds the stick"
+    page._held_until_s = math.inf
     assert answer(1, 0, "b") == Answer(False, "another page drives")
-    # 3. A release counts, however late; another page drives after a while without requests.
+    # A release counts, however late; another page drives after a while without requests.
     count = len(rover.twists)
     assert answer(0, 0, late_ms=5000) == Answer(True, "the stick is released: it stands")
     wait_until(lambda: len(rover.twists) > count)
     assert rover.twists[count:] == [(0.0, 0.0)]
-    takes_ms[0], page._held_until_s = 0, 0.0
+    page._held_until_s = 0.0
     assert answer(1, 0, "b").done
 
 
@@ -369,30 +339,27 @@ def test_a_stop_on_a_connection_that_is_lost_is_sent_on_another_one(tmp_path: Pa
 
 
 def test_browsers_that_come_at_any_time_show_the_same_path() -> None:
-    path, version = LivePath(), 1
+    feed = RobotFeed(BusConfig())
     shown: dict[int, list[list[float]]] = {1: [], 7: [], 100: []}
-    seen = dict.fromkeys(shown, 0)
+    thinned = dict.fromkeys(shown, 0)
 
     def follow(every: int) -> None:
         """Apply the next news as the page does."""
-        news = path.news(seen[every])
+        news = feed.news(feed.version, len(shown[every]), thinned[every]).get("path")
         if news is not None:
             assert news["from"] <= len(shown[every])
             shown[every][news["from"] :] = news["points"]
-        seen[every] = version
+            thinned[every] = news["thinned"]
 
     for step in range(20_000):
-        version = step + 1
-        path.add(0.01 * step, math.sin(0.01 * step), version, gap=step in (500, 15_000))
-        if step == 9000:
-            path.clear(version)
+        feed.path.add(Vertex(0.01 * step, math.sin(0.01 * step), step == 500))
         for every in shown:
-            if step % every == 0:
+            if step % (50 * every) == 0:
                 follow(every)
     for every in shown:
         follow(every)
     assert shown[1] == shown[7] == shown[100] and 1000 < len(shown[1]) <= MOST_POINTS
-    assert sum(len(point) > 2 for point in shown[1]) == 1 and shown[1][0][0] == pytest.approx(90.01, abs=0.1)
+    assert sum(len(point) > 2 for point in shown[1]) == 1
 
 
 # Messages.
@@ -470,38 +437,28 @@ def add_pose(feed: RobotFeed, seq: int, run: str = "a") -> None:
 
 
 def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odom_before() -> None:
-    """The pages are sent news without a map, obstacles, navigation and panorama, in place of the old ones."""
+    """Its run is another one, for which the pages load again, and there is no map, scan, navigation or panorama."""
     feed = RobotFeed(BusConfig())
-    navigation = DiagnosticStatus(NAVIGATION, 0, "", {str(Key.STATE): "driving", str(Key.TASK): "goal"})
+    navigation = DiagnosticStatus(NAVIGATION, 0, "", {str(Key.STATE): "driving", "task": "goal"})
     large = {
         "map": MAP,
         "scan": SCAN,
         "panorama": panorama(b"\xff\xd8 bytes"),
         "navigation": codec.diagnostics_cdr(10**18, [navigation]),
     }
-    for run in "ab":  # with nothing to forget there is nothing to send
-        add_pose(feed, 0, run)
-    feed.process_inbox()
-    assert not feed.news(0).keys() & large.keys()
-    add_pose(feed, 4, "b")
+    add_pose(feed, 0)
+    add_pose(feed, 4)
     feed.state.put("map_pose", codec.map_pose_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
     feed.process_inbox()
-
-    async def take() -> None:
-        for topic, payload in large.items():
-            await feed.take_large(ReceivedMessage(0, topic, payload, b"", 0))
-
-    asyncio.run(take())
+    for topic, payload in large.items():
+        feed.process_large(ReceivedMessage(0, topic, payload, b"", 0))
     news = feed.news(0)
     assert news["state"]["map_in_odom"] is not None and news["map"]["width"] == 3 and news["panorama"]
     assert news["scan"]["points"] and news["navigation"]["task"] == "goal" and len(news["path"]["points"]) == 2
-    add_pose(feed, 5)
+    add_pose(feed, 5, "b")
     feed.process_inbox()
     news = feed.news(0)
-    assert news["state"]["map_in_odom"] is None and news["map"] == {"width": 0, "frame": "odom"}
-    assert news["panorama"] == 0 and news["scan"] == {"points": [], "nearest": None}
-    report = news["navigation"]
-    assert (report["state"], report["task"], report["left_m"]) == ("", "", None)
+    assert news["state"]["map_in_odom"] is None and news["state"]["run"] == "b" and not news.keys() & large.keys()
 
 
 def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
