@@ -15,6 +15,7 @@ Several kinds of message, and commands, share one connection: see Robot and Driv
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -23,15 +24,14 @@ from typing import Any, Final, Generic, Self, TypeVar
 import zenoh
 
 from omnid.errors import OmnidError
+from omnid.transport import codec, ros2, topics
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Cloud, Diagnostics, Map, PlanarPath, Pose, PoseAttachment, Scan
-from omnid.transport.driver import CONNECT_S, POLL_S, Driver, RobotTime
-from omnid.transport.session import ALIVE, HERE, QUERY_S, Unreachable, open_client, robots_there
+from omnid.transport.session import ALIVE, CONNECT_S, HERE, PERIOD_S, Unreachable, has_receiver, open_client
 from omnid.transport.status_names import NavigationReport
 from omnid.transport.topics import PUBLISHED, Answer
 
 __all__ = [
-    "CONNECT_S",
     "HERE",
     "Answer",
     "Cloud",
@@ -49,6 +49,7 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
 _TOPICS: Final[dict[type[Any], str]] = {
     Pose: "odom",
     Diagnostics: "status",
@@ -57,6 +58,12 @@ _TOPICS: Final[dict[type[Any], str]] = {
     PlanarPath: "path",
     NavigationReport: "navigation",
     Scan: "scan",
+}
+# A stop must not be lost, and overtakes all else; requests go the same way.
+_QUALITY: Final[dict[str, Any]] = {
+    "congestion_control": zenoh.CongestionControl.BLOCK,
+    "priority": zenoh.Priority.REAL_TIME,
+    "express": True,
 }
 
 
@@ -68,7 +75,7 @@ class Subscription(Generic[T]):
         session: zenoh.Session,
         key: str,
         decode: Callable[[bytes, bytes], T],
-        on_close: Callable[[], None] | None = None,
+        on_close: Callable[[], None] = lambda: None,
     ) -> None:
         self._decode, self._on_close = decode, on_close
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
@@ -86,7 +93,7 @@ class Subscription(Generic[T]):
         """Return the next message, or None after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while (message := self.newest()) is None and time.monotonic() < deadline_s:
-            time.sleep(POLL_S)  # the channel has no wait with a timeout
+            time.sleep(PERIOD_S)  # the channel has no wait with a timeout
         return message
 
     def __iter__(self) -> Iterator[T]:
@@ -102,8 +109,7 @@ class Subscription(Generic[T]):
         """End the subscription."""
         with suppress(zenoh.ZError):
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
-        if self._on_close is not None:
-            self._on_close()
+        self._on_close()
 
     def __enter__(self) -> Self:
         return self
@@ -127,7 +133,7 @@ def _attachment(sample: zenoh.Sample) -> bytes:
 
 def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
     """Return the answer to a query for a key, if there is any."""
-    replies = list(session.get(key, timeout=QUERY_S))
+    replies = list(session.get(key, timeout=CONNECT_S))
     return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
@@ -138,18 +144,14 @@ class Robot:
     """
 
     def __init__(
-        self,
-        robot: str = "omnid",
-        connect: str | Sequence[str] = (HERE,),
-        settings: BusConfig | None = None,
-        timeout_s: float = 0.0,
+        self, robot: str = "omnid", connect: str | Sequence[str] = (HERE,), settings: BusConfig | None = None
     ) -> None:
-        """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
+        """Connect; raise Unreachable where no endpoint answers within CONNECT_S, OmnidError for wrong settings."""
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
         given = settings or BusConfig(robot=robot, connect=endpoints)
         self.name = given.robot
-        self._session = open_client(given, timeout_s)
-        self._time = RobotTime(self._session, self.name)
+        self._session = open_client(given)
+        self._time = _RobotTime(self._session, self.name)
         self._declared: list[object] = []  # zenoh undeclares what nothing refers to any longer
 
     def close(self) -> None:
@@ -163,11 +165,8 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def subscribe(self, kind: type[T]) -> Subscription[T]:
+    def subscribe(self, kind: type[T], on_close: Callable[[], None] = lambda: None) -> Subscription[T]:
         """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map, NavigationReport or Scan."""
-        return self._subscription(kind)
-
-    def _subscription(self, kind: type[T], on_close: Callable[[], None] | None = None) -> Subscription[T]:
         topic = _TOPICS[kind]
         return Subscription(self._session, f"{self.name}/{topic}", PUBLISHED[topic].decode, on_close)
 
@@ -190,20 +189,14 @@ class Robot:
         if kept and (sample := _queried(self._session, f"{self.name}/{topic}")) is not None:
             on_sample(sample)
 
-        def end() -> None:
-            self._declared.remove(subscriber)
-            with suppress(zenoh.ZError):
-                subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
-
-        return end
+        return subscriber.undeclare
 
     def driver(self, source: str = "") -> Driver:
         """Return a sender of commands to the wheels.
 
         source: one of controller.sources.names, such as "planner"; empty for that of the highest priority.
         """
-        if not self._time.now_ns:
-            self._time.ask()
+        self._time.now_ns(waits=not self._time.is_known)
         return Driver(self._session, self.name, self._time, source)
 
     def query(self, name: str) -> str:
@@ -221,23 +214,169 @@ class Robot:
         self._declared.append(tokens.declare_subscriber(f"{self.name}/{ALIVE}", on_token, history=True))
 
     @property
-    def robots_there(self) -> str:
-        """Names of the robots that are there, this one included, as a part of a sentence."""
-        return robots_there(self._session)
-
-    @property
     def alive(self) -> bool:
         """True if the robot's daemon runs and can be reached."""
-        replies = self._session.liveliness().get(f"{self.name}/{ALIVE}", timeout=QUERY_S)
+        replies = self._session.liveliness().get(f"{self.name}/{ALIVE}", timeout=CONNECT_S)
         return any(reply.ok is not None for reply in replies)
 
 
 def subscribe(
-    robot: str = "omnid",
-    connect: str | Sequence[str] = (HERE,),
-    settings: BusConfig | None = None,
-    timeout_s: float = 0.0,
+    robot: str = "omnid", connect: str | Sequence[str] = (HERE,), settings: BusConfig | None = None
 ) -> Subscription[Pose]:
     """Subscribe to a robot's poses over a connection of their own; arguments as those of Robot."""
-    connection = Robot(robot, connect, settings, timeout_s)
-    return connection._subscription(Pose, connection.close)
+    connection = Robot(robot, connect, settings)
+    return connection.subscribe(Pose, connection.close)
+
+
+class _RobotTime:
+    """A robot's own time, which senders attach to what they send, so that no clock of theirs matters.
+
+    The robot is asked for it, at most once in CONNECT_S; in between it is followed by this computer's monotonic clock.
+    """
+
+    def __init__(self, session: zenoh.Session, robot: str) -> None:
+        self._session, self._key = session, f"{robot}/{topics.TIME}"
+        self._offset_ns: int | None = None  # the robot's time less ours, as late as its answer came
+        self._asked_s = -math.inf
+
+    @property
+    def is_known(self) -> bool:
+        """True once the robot has answered."""
+        return self._offset_ns is not None
+
+    def now_ns(self, *, waits: bool = False) -> int:
+        """Return the robot's time, 0 where it is not known. waits: ask now, and wait for the answer of one there."""
+        if waits or time.monotonic() - self._asked_s > CONNECT_S:
+            self._asked_s = time.monotonic()
+            if waits:
+                for reply in self._session.get(self._key, timeout=CONNECT_S):
+                    self._set(reply)
+            else:
+                self._session.get(self._key, self._set, timeout=CONNECT_S)
+        return 0 if self._offset_ns is None else time.monotonic_ns() + self._offset_ns
+
+    def _set(self, reply: zenoh.Reply) -> None:
+        with suppress(ValueError):
+            if reply.ok is not None:
+                self._offset_ns = int(reply.ok.payload.to_bytes()) - time.monotonic_ns()
+
+
+class Driver:
+    """Sender of commands and requests. It attaches the robot's own time, so this computer's clock need not be right.
+
+    A command is valid for controller.deadlines.command_s only: keep sending, or the wheels stop.
+
+    The wheels turn only while the robot is armed: it is disarmed at its start, by each stop and by each fault. Two
+    senders of one source do not drive at once: the first keeps it until it has been silent for a while.
+
+    Drive from one waypoint to the next:
+
+        import math
+        from omnid.client import Pose, Robot
+
+        with Robot("omnid") as robot:
+            driver, poses = robot.driver(), robot.subscribe(Pose)
+            print(driver.arm().text)
+            for x_m, y_m in [(1.0, 0.0), (1.0, 1.0)]:
+                for pose in poses:
+                    dx_m, dy_m = x_m - pose.x_m, y_m - pose.y_m
+                    if math.hypot(dx_m, dy_m) < 0.1 or pose.state == "lost":
+                        break
+                    driver.heading(0.3, math.atan2(dy_m, dx_m))
+            driver.twist(0.0, 0.0)
+    """
+
+    def __init__(self, session: zenoh.Session, robot: str, own_time: _RobotTime, source: str = "") -> None:
+        prefix = f"cmd/{source}" if source else "cmd"
+        self._session, self._robot, self._time = session, robot, own_time
+        self._twist, self._heading = f"{prefix}/{topics.TWIST}", f"{prefix}/{topics.HEADING}"
+        self._publishers = {
+            topic: session.declare_publisher(f"{robot}/{topic}", encoding=zenoh.Encoding.APPLICATION_CDR, **_QUALITY)
+            for topic in (self._twist, self._heading, topics.STOP, topics.ARM)
+        }
+        self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
+        self.asked_ns = 0  # time of sending of the newest request, which the reports of a drive repeat
+
+    @property
+    def connected(self) -> bool:
+        """True if a robot subscribes to the commands."""
+        return has_receiver(self._publishers[topics.STOP])
+
+    def require_connected(self) -> None:
+        """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""
+        self._require(self._publishers[topics.STOP], "receives commands")
+
+    def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
+        """Drive with this forward speed and yaw rate (counter-clockwise)."""
+        self.send(self._twist, codec.twist_stamped_cdr(time.time_ns(), "base_link", velocity_mps, yaw_rate_radps))
+
+    def heading(self, velocity_mps: float, heading_rad: float) -> None:
+        """Drive with this speed and hold a heading in odom (counter-clockwise)."""
+        self.send(self._heading, codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
+
+    def stop(self) -> None:
+        """Stop the wheels, whatever else was commanded, until `arm` is called."""
+        self.send(topics.STOP, b"")
+
+    def arm(self, timeout_s: float = ANSWER_S) -> Answer:
+        """Ask the robot to arm; it refuses while a fault holds. Only commands that arrive after it move the wheels.
+
+        Raise OmnidError as `ask`.
+        """
+        return self.ask(topics.ARM, codec.header_cdr, timeout_s)
+
+    def goal(self, x_m: float, y_m: float, heading_rad: float | None = None, frame: str = "odom") -> Answer:
+        """Ask the robot to drive to a pose in odom or map; None: with any heading. Raise OmnidError as `ask`."""
+        return self.ask(topics.GOAL, lambda now_ns: codec.goal_cdr(now_ns, frame, (x_m, y_m), heading_rad))
+
+    def navigate(self, verb: str) -> Answer:
+        """Ask the robot to cancel, pause or resume its drive. Raise OmnidError as `ask`."""
+        return self.ask(topics.NAVIGATION, lambda _: codec.string_cdr(verb))
+
+    def route(self, text: str) -> Answer:
+        """Ask for what a text of cmd/route says, such as "repeat hall". Raise OmnidError as `ask`."""
+        return self.ask(topics.ROUTE, lambda _: codec.string_cdr(text))
+
+    def save_map(self) -> Answer:
+        """Ask the robot to save its map now. Raise OmnidError as `ask`."""
+        return self.ask(topics.MAP, lambda _: codec.string_cdr(topics.SAVE_MAP))
+
+    def ask(self, topic: str, payload_at: Callable[[int], bytes], timeout_s: float = ANSWER_S) -> Answer:
+        """Send the request that a message on a topic such as cmd/goal is, and wait for the robot's answer.
+
+        payload_at: returns the CDR bytes for a time of sending [ns of Unix time]. Raise OmnidError where no robot takes
+        such requests within CONNECT_S, or none answers.
+        """
+        key = f"{self._robot}/{topics.request_key(topic)}"
+        with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
+            self._require(querier, "takes such requests")
+            self._time.now_ns(waits=True)
+            self.asked_ns = now_ns = time.time_ns()
+            for reply in querier.get(payload=payload_at(now_ns), attachment=self._attached(now_ns)):
+                if reply.ok is not None and (answer := topics.answer_of(reply.ok.payload.to_bytes())) is not None:
+                    return answer
+        raise OmnidError(
+            f"{self._robot} has not answered: either this program must not command it (access_control in "
+            "zenoh's file of the robot or router), or it gives no poses; see `omnid listen`"
+        )
+
+    def send(self, topic: str, payload: bytes) -> None:
+        """Send CDR bytes on a topic of the wheels; the identity of this program distinguishes senders."""
+        publisher, attachment = self._publishers[topic], self._attached(time.time_ns())
+        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent), attachment=attachment)
+
+    def _attached(self, sent_ns: int) -> bytes:
+        """Return the attachment with the time of sending: by this computer's clock, and by the robot's own."""
+        self._sent += 1
+        return ros2.attachment(self._sent, sent_ns, self._gid, self._time.now_ns())
+
+    def _require(self, declared: zenoh.Publisher | zenoh.Querier, does: str) -> None:
+        """Wait for a robot that takes what is sent. Raise OmnidError after CONNECT_S."""
+        deadline_s = time.monotonic() + CONNECT_S
+        while not has_receiver(declared):
+            if time.monotonic() > deadline_s:
+                raise OmnidError(
+                    f"no robot {self._robot!r} {does} there: check --robot and --connect, and that its daemon runs, "
+                    "with a motor where it is to drive"
+                )
+            time.sleep(PERIOD_S)

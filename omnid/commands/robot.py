@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable
 from typing import Final
 
-from omnid.client import CONNECT_S, Answer, Driver, NavigationReport, Robot
+from omnid.client import Answer, Driver, NavigationReport, Robot
 from omnid.commands.options import ROBOT, SETTINGS, command, settings_of
 from omnid.core.navigation.requests import route_name
 from omnid.engine.logging_setup import HANDLER
@@ -182,7 +182,7 @@ def granted(robot: Robot, answer: Answer) -> str:
 
 
 def _connected(args: argparse.Namespace) -> Robot:
-    return Robot(settings=settings_of(args).bus, timeout_s=CONNECT_S)
+    return Robot(settings=settings_of(args).bus)
 
 
 def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int:

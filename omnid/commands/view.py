@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib.atomic_file import write_file
 from drivers.errors import FrameDecodeError
-from omnid.client import CONNECT_S, Robot
+from omnid.client import Robot
 from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, failed, settings_of, warn
 from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
@@ -127,7 +127,7 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
     end_s, signals, state = time.monotonic() + seconds, list[int](), RobotState()
     with (
         handle_stop_signals(lambda number, _: signals.append(number)),
-        Robot(settings=config.bus, timeout_s=CONNECT_S) as robot,
+        Robot(settings=config.bus) as robot,
     ):
         for topic in (ODOMETRY, MAP_POSE, SCAN, PANORAMA, STATUS, CLOUD):
             robot.on_message(state.put, topic, kept=topic in (STATUS, CLOUD))

@@ -57,7 +57,7 @@ class StatusCollector:
         now_s = time.monotonic()
         self._span_s, self._before_s = now_s - self._before_s, now_s
         found: dict[str, Stats] = {status_names.ODOMETRY: self._odometry(), status_names.PAIRING: self._pairing()}
-        found |= {status_names.camera_name(name): self._camera(name) for name in self._cameras}
+        found |= {f"{status_names.PREFIX}{name} camera": self._camera(name) for name in self._cameras}
         found |= {name: stats() for name, stats in self._parts.items()}
         for stage in self._telemetry.stages:
             rate_hz = self._rate_hz(stage.name, stage.processed)

@@ -43,7 +43,6 @@ def listen(bus: BusConfig, seconds: float | None) -> int:
                 robot.on_message(state.put, "odom")
                 robot.on_message(state.put, "status", kept=True)
                 robot.on_alive(state.set_alive)
-                state.robots_there = robot.robots_there
             # 2. Process messages for a period, and show the state.
             next_s = min(end_s, time.monotonic() + SHOW_PERIOD_S)
             while (left_s := next_s - time.monotonic()) > 0 and not signals:

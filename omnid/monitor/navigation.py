@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from contextlib import closing, nullcontext
 from typing import Final
 
-from omnid.client import CONNECT_S, HERE, Diagnostics, NavigationReport, Robot
+from omnid.client import ANSWER_S, HERE, Diagnostics, NavigationReport, Robot
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.driver import ANSWER_S
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from omnid.transport.stop_datagram import STOPPED, StopSender
 
@@ -53,7 +52,7 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = 
         if datagrams.ask(REPEAT_S):
             return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
         with (
-            nullcontext(connection) if connection else Robot(settings=bus, timeout_s=CONNECT_S) as robot,
+            nullcontext(connection) if connection else Robot(settings=bus) as robot,
             robot.subscribe(Diagnostics) as statuses,
         ):
             driver = robot.driver()

@@ -47,7 +47,6 @@ class RobotState:
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
-        self.robots_there = ""  # robots found at the time of connecting, as a part of a sentence
         self.poses = self.missed = self.broken = 0
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.recent: deque[Pose] = deque(maxlen=_RECENT)  # newest poses of the run: what is seen from one comes later
@@ -148,7 +147,7 @@ class RobotState:
     def state(self) -> str:
         """Tracking state of the newest pose, or the time since it and whether the daemon is still there."""
         if self.pose is None:
-            return f"no pose yet ({self.robots_there})" if self.robots_there and not self.alive else "no pose yet"
+            return "no pose yet: no robot of this name is there" if self.alive is None else "no pose yet"
         if self.time_since_pose_s > NO_POSE_S:
             gone = ", its daemon has ended or cannot be reached" if self.alive is False else ""
             return f"no pose for {self.time_since_pose_s:.0f} s{gone}"

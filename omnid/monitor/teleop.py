@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from io import DEFAULT_BUFFER_SIZE
 from typing import Final
 
-from omnid.client import CONNECT_S, Diagnostics, Driver, Robot
+from omnid.client import Diagnostics, Driver, Robot
 from omnid.core.control.heading_controller import VelocityLimits
 from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError
@@ -94,7 +94,7 @@ def teleoperate(bus: BusConfig) -> int:
         raise OmnidError("omnid drive needs a keyboard: run it in a terminal")
     with (
         raw_keys() as keys,
-        Robot(settings=bus, timeout_s=CONNECT_S) as robot,
+        Robot(settings=bus) as robot,
         robot.subscribe(Diagnostics) as statuses,
     ):
         driver, stick = robot.driver(), Stick(limits_of(robot))

@@ -319,11 +319,17 @@ def _subscribe(
     sources, joints = config.controller.sources.names, joint_wheels(config)
     # 1. Samples of gyro and wheels, unless they come with the images of a log or of a simulation, whose motion others
     #    would not fit. A motor controller gives those of its wheels.
-    sensors = set()
-    if config.motion.imu != "off" and not robot.brings_samples:
-        sensors.add(topics.IMU)
-    if config.motion.wheels != "off" and not robot.brings_samples and controller is None:
-        sensors.add(topics.JOINT_STATES if joints else topics.WHEEL_ODOM)
+    used = {
+        topics.IMU: config.motion.imu != "off",
+        topics.JOINT_STATES if joints else topics.WHEEL_ODOM: config.motion.wheels != "off" and controller is None,
+    }
+
+    def add_sample(topic: str, payload: bytes) -> None:
+        sample = sample_from_cdr(payload, topics.command_of(topic).schema, clock.stamp_ns, joints)
+        if sample is not None:
+            front_end.pairing.motion.add(sample)
+
+    sensors = {topic: partial(add_sample, topic) for topic in used if used[topic] and not robot.brings_samples}
     # 2. Commands and requests.
     freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))
     bus.serve(topics.TIME, freshness.own_time)
@@ -341,8 +347,6 @@ def _subscribe(
         is_unique=lambda: bus.is_unique,
         navigate=ask if controller is not None and PLANNER in sources else None,
         save_map=None if saves is None else lambda id: saves.push(SaveMap(id)),
-        take_sample=front_end.pairing.motion.add,
-        decode_sample=partial(sample_from_cdr, stamp_ns=clock.stamp_ns, joints=joints),
         sensors=sensors,
         why_not=why_not,
         report=warn,

@@ -186,22 +186,22 @@ def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32],
 
 
 def navigation_stats(update: NavigationUpdate) -> Stats:
-    """Return the numbers of an update, for its own topic."""
+    """Return the numbers of an update, for its own topic: see NavigationReport."""
     hindered = (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED)
     severity = "_warning" if update.state in hindered else "_words"
     severity = "_error" if update.state == NavigationState.FAILED else severity
-    stats = {
+    stats: dict[str, object] = {
         Key.STATE: update.state,
-        Key.TASK: update.task,
-        Key.COMMAND_NS: update.command_ns or "",
-        Key.REASON: update.reason,
-        Key.LEFT_M: update.left_m,
+        "task": update.task,
+        "command_ns": update.command_ns or "",
+        "reason": update.reason,
+        "left_m": update.left_m,
         "offset_m": update.offset_m,  # of the base to the left of the path
         "loops_left": update.loops_left if update.loops_left > 1 else "",  # of a route, with the one that is driven
         severity: f"{update.state}: {update.reason}" if update.reason else update.state,
     }
     if update.teaching:
-        stats |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: update.taught_m}
+        stats |= {"teaching": update.teaching, "taught_m": update.taught_m}
     if update.answer is not None:
-        stats |= {Key.REQUEST: update.answer.request, Key.REFUSAL: update.answer.refusal}
+        stats |= {"request": update.answer.request, "refusal": update.answer.refusal}
     return stats

@@ -1,15 +1,22 @@
 """The zenoh bus: publishes CDR messages below the robot's name, answers queries and receives commands.
 
 `publish` may block for up to zenoh's drop time (1 ms, 50 ms for fragmented messages), so only sinks with a bounded
-inbox of their own, and tickers, call it. Two threads take what others send, within budgets: commands, and queries.
-Each topic has its plain key, and what ROS 2 needs to find and to read it.
+inbox of their own, and tickers, call it. Each topic has its plain key, and what ROS 2 needs to find and to read it.
+
+What others send, zenoh puts into a ring for each key without any Python, where the newest replace the oldest. Two
+threads (commands, queries) take a bounded number of them, so that no flood takes the time of the stages: with a Python
+callback, each message would.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from itertools import count
 from operator import attrgetter
 from typing import Any, Final
 
@@ -20,29 +27,60 @@ from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.intake import PERIOD_S, CommandIntake, OpenRequests, Ring
-from omnid.transport.session import ALIVE, has_receiver, open_session, reason
+from omnid.transport.session import ALIVE, PERIOD_S, has_receiver, open_session, reason
 from omnid.transport.stop_datagram import StopListener
-from omnid.transport.topics import ARM, CLOCK, PUBLISHED, STOP, Request, Topic, command_of, plain_key, ros_name
+from omnid.transport.topics import (
+    ARM,
+    CLOCK,
+    MOST_OPEN,
+    PUBLISHED,
+    STOP,
+    Answer,
+    Request,
+    command_of,
+    plain_key,
+    request_key,
+    ros_name,
+)
 
 __all__ = ["Bus", "BusConfig"]
 
 _HEARTBEAT_S: Final = 0.5  # rmw_zenoh's
-QUERY_PERIOD_S: Final = 0.01
 
 
 class TopicPublisher:
-    """The zenoh publishers of one topic: the plain key, and the key of ROS 2 where that is another."""
+    """The zenoh publishers of one topic: the plain key, and the key of ROS 2 where that is another.
+
+    They are not express: each express message fills one of the few batches of every router on the way. Poses were
+    dropped there, and the latency is the same.
+    """
 
     def __init__(self, session: zenoh.Session, config: BusConfig, name: str, node: ros2.RosNode) -> None:
         topic = PUBLISHED[name]
-        token = node.publisher(name, topic.schema, transient_local=topic.transient_local)
-        self._gid, self._seq = ros2.gid_of(token), 0
-        self._plain = _declared_publisher(session, plain_key(config.robot, name), topic)
+        self._gid, self._seq = ros2.gid_of(node.publisher(name, topic.schema, latched=topic.transient_local)), 0
+        quality: dict[str, Any] = {
+            "encoding": zenoh.Encoding.APPLICATION_CDR,
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "priority": zenoh.Priority.REAL_TIME if topic.realtime else zenoh.Priority.DATA,
+            "express": False,
+            "reliability": zenoh.Reliability.RELIABLE,
+        }
+        self._plain = session.declare_publisher(plain_key(config.robot, name), **quality)
         self._ros: zenoh.Publisher | ext.AdvancedPublisher | None = None
         if config.ros2 == "rmw_zenoh":
             key = ros2.data_key(config.ros2_domain, ros_name(config.robot, name), topic.schema)
-            self._ros = _declared_publisher(session, key, topic, keeps=topic.transient_local)
+            if not topic.transient_local:
+                self._ros = session.declare_publisher(key, **quality)
+            else:  # as rmw_zenoh (rmw_publisher_data.cpp): a cache, detection of the publisher, heartbeats
+                heartbeats = ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S)
+                self._ros = ext.declare_advanced_publisher(
+                    session,
+                    key,
+                    **quality,
+                    cache=ext.CacheConfig(1),
+                    sample_miss_detection=heartbeats,
+                    publisher_detection=True,
+                )
 
     @property
     def is_received(self) -> bool:
@@ -57,31 +95,32 @@ class TopicPublisher:
             self._ros.put(payload, attachment=ros2.attachment(self._seq, time.time_ns(), self._gid))
 
 
-def _declared_publisher(
-    session: zenoh.Session, key: str, topic: Topic, *, keeps: bool = False
-) -> zenoh.Publisher | ext.AdvancedPublisher:
-    """Declare a publisher, not express: each express message fills one of the few batches of every router on the way.
+class Ring:
+    """The messages, or the queries, of one key that wait; at most so many a second are taken.
 
-    Poses were dropped there, and the latency is the same. keeps: it keeps its newest message for late subscribers, as
-    rmw_zenoh does for transient local (rmw_publisher_data.cpp): a cache, detection of the publisher, heartbeats.
+    It holds those of a quarter of a second: so long a flood can hold one up. floods: how often there were more.
     """
-    quality: dict[str, Any] = {
-        "encoding": zenoh.Encoding.APPLICATION_CDR,
-        "congestion_control": zenoh.CongestionControl.DROP,
-        "priority": zenoh.Priority.REAL_TIME if topic.realtime else zenoh.Priority.DATA,
-        "express": False,
-        "reliability": zenoh.Reliability.RELIABLE,
-    }
-    if not keeps:
-        return session.declare_publisher(key, **quality)
-    return ext.declare_advanced_publisher(
-        session,
-        key,
-        **quality,
-        cache=ext.CacheConfig(1),
-        sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
-        publisher_detection=True,
-    )
+
+    def __init__(self, declare: Callable[..., Any], key: str, rate_hz: float, topic: str = "") -> None:
+        self.key, self.topic, self._rate_hz = key, topic, rate_hz
+        self._capacity = max(4, round(rate_hz / 4))
+        self._declared = declare(key, zenoh.handlers.RingChannel(self._capacity))
+        self._allowed, self._at_s = 0.0, -math.inf
+        self.floods = 0
+
+    def messages(self) -> Iterator[Any]:
+        """Yield the messages that may be decoded now; the others wait, until newer ones replace them."""
+        now_s = time.monotonic()
+        # One more than the ring holds at once: what comes at once is no flood.
+        self._allowed = min(self._capacity + 1, self._allowed + (now_s - self._at_s) * self._rate_hz)
+        self._at_s = now_s
+        while self._allowed >= 1.0:
+            # An empty ring is the usual case, hundreds of times a second: it costs one call.
+            if (message := self._declared.try_recv()) is None:
+                return
+            self._allowed -= 1.0
+            yield message
+        self.floods += 1
 
 
 class Bus:
@@ -99,7 +138,7 @@ class Bus:
         self._session = session = open_session(config)
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._namesakes: set[str] = set()  # liveliness tokens of other robots of this name
-        self._on_command: Callable[[Request], None] | None = None
+        self._on_command: Callable[[Request], object] = lambda _: None
         self._watch_for_namesakes()
         # A robot whose time is the computer's has none: programs that wait for it would believe to be in a simulation.
         topics = [name for name in PUBLISHED if gives_time or name != CLOCK]
@@ -108,16 +147,17 @@ class Bus:
         self._newest: dict[str, tuple[bytes, bytes | None]] = {}  # payload and attachment of latched topics
         self._texts: dict[str, str | Callable[[], str]] = {}  # answers to queries, by name
         self._queries = {name: self._queryable(name) for name in topics if PUBLISHED[name].latched}
-        self._requests = OpenRequests()
-        self.answer = self._requests.answer  # answers a request; nothing happens where no query waits for it
-        self._commands: CommandIntake | None = None
+        self._rings: list[Ring] = []  # of commands; those of requests to arm and of stops are the last ones
+        self._ids = count(1)
+        self._open: dict[int, tuple[str, zenoh.Query]] = {}  # requests that wait for their answers, by id
+        self._answered: deque[tuple[zenoh.Query, Answer]] = deque(maxlen=MOST_OPEN)
         self._stop_listener: StopListener | None = None
         self._flooded = 0  # floods at the last status
-        self._pollers = [Poller(self._answer_queries, QUERY_PERIOD_S, "bus queries")]
+        self._pollers = [Poller(self._answer_queries, PERIOD_S, "bus queries")]
 
     def stats(self) -> dict[str, object]:
         """Return whether the name is unique, and how often others sent too much."""
-        rings = [*(self._commands.rings if self._commands else ()), *self._queries.values()]
+        rings = [*self._rings, *self._queries.values()]
         before, self._flooded = self._flooded, sum(ring.floods for ring in rings)
         warning = ""
         if self._flooded > before:
@@ -170,14 +210,31 @@ class Bus:
         self._on_command = callback
         if not self.is_unique:
             callback(Request(STOP))
-        self._commands = CommandIntake(self._session, self._config, topics, self._requests, callback)
+        subscriber, robot = self._session.declare_subscriber, self._config.robot
+        for topic in (*sorted({*topics} - {ARM, STOP}), ARM, STOP):
+            command = command_of(topic)
+            places: list[tuple[Callable[..., Any], str]] = [(subscriber, f"{robot}/{topic}")]
+            if self._config.ros2 == "rmw_zenoh":  # a key of it ends with the type of the message and the type's hash
+                places += [(subscriber, f"{self._config.ros2_domain}/{robot}/{topic}/*/*")]
+            if command.is_request:
+                places += [(self._session.declare_queryable, f"{robot}/{request_key(topic)}")]
+            self._rings += [Ring(declare, key, command.rate_hz, topic) for declare, key in places]
         self._stop_listener = StopListener(self._config, lambda: callback(Request(STOP)), is_stopped)
         self._pollers += [
-            Poller(self._commands.process, PERIOD_S, "bus commands"),
+            Poller(self._take_commands, PERIOD_S, "bus commands"),
             Poller(self._stop_listener.process, PERIOD_S, "stop datagrams"),
         ]
         for name, schema in topics.items():
             self._node.subscription(name, schema)
+
+    def answer(self, id: int, answer: Answer, *, also_before: str = "") -> None:
+        """Answer a request, once, from any thread, without waiting; nothing happens where no query waits for it.
+
+        also_before: a topic on which a request takes the place of earlier ones, which get the same answer.
+        """
+        for other, (topic, query) in self._open.copy().items():
+            if (other == id or (other < id and topic == also_before)) and self._open.pop(other, None) is not None:
+                self._answered.append((query, answer))
 
     def close(self) -> None:
         """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""
@@ -211,8 +268,7 @@ class Bus:
                 if was_unique:
                     self._warn(self._same_name)
                     # Two robots that obey one operator are not what the operator expects.
-                    if self._on_command is not None:
-                        self._on_command(Request(STOP))
+                    self._on_command(Request(STOP))
 
         tokens = self._session.liveliness()
         self._declared += [
@@ -226,8 +282,14 @@ class Bus:
         return Ring(self._session.declare_queryable, plain_key(self._config.robot, name), rate_hz)
 
     def _answer_queries(self) -> None:
-        """Answer the queries that have come, and the requests that are decided."""
-        self._requests.send()
+        """Answer the requests that are decided, and the queries that have come.
+
+        This may block while a program does not read.
+        """
+        while self._answered:
+            query, answer = self._answered.popleft()
+            with suppress(zenoh.ZError):  # the program has gone
+                query.reply(query.key_expr, json.dumps(answer._asdict()), encoding=zenoh.Encoding.APPLICATION_JSON)
         for name, ring in list(self._queries.items()):
             for query in ring.messages():
                 if (text := self._texts.get(name)) is not None:
@@ -235,3 +297,45 @@ class Bus:
                 elif name in self._newest:
                     payload, attachment = self._newest[name]
                     query.reply(ring.key, payload, encoding=zenoh.Encoding.APPLICATION_CDR, attachment=attachment)
+
+    def _take_commands(self) -> None:
+        """Pass on what has come. Of a stop and a request to arm in one pass the stop wins.
+
+        Which of the two was sent first is not known, because messages of different topics have no common order.
+        """
+        # 1. Stops.
+        stopped, asked_to_arm = self._take_stops(), False
+        # 2. All other messages; requests to arm are the last of them.
+        for ring in self._rings:
+            for message in ring.messages() if ring.topic != STOP else ():
+                asked_to_arm |= ring.topic == ARM
+                # A request names one robot and one topic: a query for several keys is none.
+                if isinstance(message, zenoh.Sample) or str(message.key_expr) == ring.key:
+                    self._pass_on(ring.topic, message)
+        # 3. After a request to arm: a stop that came in the meantime, or else that of step 1 once more.
+        if asked_to_arm and not self._take_stops() and stopped:
+            self._on_command(Request(STOP))
+
+    def _take_stops(self) -> bool:
+        """Pass on the stops that have come; return whether there was one."""
+        samples = [sample for ring in self._rings if ring.topic == STOP for sample in ring.messages()]
+        if samples:
+            self._pass_on(STOP, samples[-1])
+        return bool(samples)
+
+    def _pass_on(self, topic: str, message: zenoh.Sample | zenoh.Query) -> None:
+        """Pass on a message with the identity of the program that sent it, empty where it names none.
+
+        Programs with omnid.client give the source of their messages and attach an identity to their requests. Programs
+        with rmw_zenoh attach the gid of their publisher. zenoh itself adds nothing. The identity proves nothing: what a
+        program may do is decided by the access rules.
+        """
+        payload, id = b"" if message.payload is None else message.payload.to_bytes(), next(self._ids)
+        sender, sent_ns, echo_ns = ros2.read_attachment(message.attachment.to_bytes() if message.attachment else b"")
+        if isinstance(message, zenoh.Query):
+            self._open[id] = topic, message
+            if len(self._open) > MOST_OPEN:  # the oldest one is dropped
+                self._open.pop(min(self._open.copy()), None)
+        elif message.source_info is not None:
+            sender = str(message.source_info.source_id.zid)
+        self._on_command(Request(topic, payload, sender, sent_ns, id, echo_ns))

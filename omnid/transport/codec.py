@@ -132,13 +132,8 @@ def decoded(payload: bytes, schema: str) -> Any:
         raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
 
 
-def _stamp_ns(message: Any) -> int:
-    """Return the stamp of a message with a header; it may be invalid, and those who rely on it check it."""
-    return header_stamp_ns(message.header)
-
-
-def header_stamp_ns(header: Any) -> int:
-    """Return the stamp of a header; it may be invalid."""
+def stamp_of(header: Any) -> int:
+    """Return the stamp of a header [ns]; it may be invalid, and those who rely on it check it."""
     return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
 
 
@@ -176,8 +171,7 @@ class PoseAttachment:
         try:
             return msgspec.json.decode(data, type=cls)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            what = f"the {len(data)} bytes attached to a pose are not its JSON ({error}); check that omnid sent them"
-            raise OmnidError(what) from error
+            raise OmnidError(f"the {len(data)} bytes attached to a pose are not its JSON ({error})") from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +232,7 @@ def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
         raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
     return Pose(
-        stamp_ns=_stamp_ns(message),
+        stamp_ns=stamp_of(message.header),
         T_odom_base=_rigid_transform(message.pose.pose),
         covariance=message.pose.covariance.reshape(6, 6),
         velocity=np.array([getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]),
@@ -266,7 +260,9 @@ def map_pose_cdr(stamp_ns: int, T_map_base: Array, covariance: Array) -> bytes:
 def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     """Decode a PoseWithCovarianceStamped with a finite, rigid pose."""
     message = decoded(payload, MAP_POSE_SCHEMA)
-    return PoseInMap(_stamp_ns(message), _rigid_transform(message.pose.pose), message.pose.covariance.reshape(6, 6))
+    return PoseInMap(
+        stamp_of(message.header), _rigid_transform(message.pose.pose), message.pose.covariance.reshape(6, 6)
+    )
 
 
 def transform_cdr(stamp_ns: int, edges: Iterable[tuple[str, str, Array]]) -> bytes:
@@ -322,7 +318,7 @@ def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
         DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
         for entry in message.status
     )
-    return Diagnostics(_stamp_ns(message), statuses)
+    return Diagnostics(stamp_of(message.header), statuses)
 
 
 # Maps and obstacles.
@@ -381,12 +377,9 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
     fields = [(entry.name, entry.offset) for entry in message.fields]
     own = fields == [(name, 4 * i) for i, name in enumerate(CLOUD_FIELDS)] and not message.is_bigendian
     if not own or message.point_step != step or message.data.size % step:
-        raise OmnidError(
-            f"a cloud with {len(fields)} fields and {message.point_step} bytes a point was found; "
-            f"expected the fields {', '.join(CLOUD_FIELDS)} in {step} bytes"
-        )
+        raise OmnidError(f"a cloud: expected the fields {', '.join(CLOUD_FIELDS)} in {step} bytes a point")
     packed = message.data.view("<f4").reshape(-1, len(CLOUD_FIELDS))
-    return Cloud(_stamp_ns(message), message.header.frame_id, packed[:, :3], packed[:, 3])
+    return Cloud(stamp_of(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -413,12 +406,10 @@ def decode_map(payload: bytes, _: bytes = b"") -> Map:
     info, T_frame_grid = message.info, _rigid_transform(message.info.origin)
     is_parallel = np.allclose(T_frame_grid[:3, :3], np.eye(3), atol=QUATERNION_TOLERANCE)
     if message.data.size != info.width * info.height or not (info.resolution > 0 and is_parallel):
-        raise OmnidError(
-            f"a map with {message.data.size} cells of {info.resolution:g} m was found; expected "
-            f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes"
-        )
+        words = f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes"
+        raise OmnidError(f"a map of {message.data.size} cells of {info.resolution:g} m: expected {words}")
     cells, corner = message.data.reshape(info.height, info.width), (info.origin.position.x, info.origin.position.y)
-    return Map(_stamp_ns(message), message.header.frame_id, cells, float(info.resolution), corner)
+    return Map(stamp_of(message.header), message.header.frame_id, cells, float(info.resolution), corner)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -450,14 +441,9 @@ def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
     start_rad, step_rad = message.angle_min, message.angle_increment
     if not (math.isfinite(start_rad) and math.isfinite(step_rad)):
         raise OmnidError(f"a scan from {start_rad} rad by {step_rad} rad was found; expected finite angles")
-    return Scan(
-        _stamp_ns(message),
-        message.header.frame_id,
-        start_rad + step_rad * np.arange(len(message.ranges)),
-        message.ranges,
-        message.intensities,
-        float(message.range_max),
-    )
+    azimuths_rad, stamp_ns = start_rad + step_rad * np.arange(len(message.ranges)), stamp_of(message.header)
+    range_max_m = float(message.range_max)
+    return Scan(stamp_ns, message.header.frame_id, azimuths_rad, message.ranges, message.intensities, range_max_m)
 
 
 # Commands and requests.
@@ -496,7 +482,7 @@ def twist_from_cdr(payload: bytes) -> TwistRecord:
         stamp_ns, frame, twist = 0, "", decoded(payload, PLAIN_TWIST_SCHEMA)
     else:
         message = decoded(payload, TWIST_SCHEMA)
-        stamp_ns, frame, twist = _stamp_ns(message), message.header.frame_id, message.twist
+        stamp_ns, frame, twist = stamp_of(message.header), message.header.frame_id, message.twist
     linear, angular = twist.linear, twist.angular
     aside = {"linear.y": linear.y, "linear.z": linear.z, "angular.x": angular.x, "angular.y": angular.y}
     return TwistRecord(stamp_ns, frame, linear.x, angular.z, aside)
@@ -510,7 +496,7 @@ def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes
 def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
     """Decode a heading command: its stamp [ns], frame, speed [m/s] and heading [rad], which need not be finite."""
     message = decoded(payload, VECTOR_SCHEMA)
-    return _stamp_ns(message), message.header.frame_id, message.vector.x, message.vector.z
+    return stamp_of(message.header), message.header.frame_id, message.vector.x, message.vector.z
 
 
 def header_cdr(stamp_ns: int) -> bytes:
@@ -535,7 +521,8 @@ def goal_cdr(stamp_ns: int, frame: str, xy: tuple[float, float], heading_rad: fl
 
 def goal_from_cdr(payload: bytes) -> PlanarPath:
     """Decode a PoseStamped that is finite and not tilted."""
-    return _planar_path(message := decoded(payload, POSE_SCHEMA), [message])
+    message = decoded(payload, POSE_SCHEMA)
+    return _planar_path(message, [message])
 
 
 def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
@@ -559,26 +546,25 @@ def path_from_cdr(payload: bytes, _: bytes = b"") -> PlanarPath:
 
 def _planar_path(message: Any, poses: Sequence[Any]) -> PlanarPath:
     """Return the content of a message with a header by its poses, which are stamped."""
+    # 1. The positions.
     xy = np.array([(one.pose.position.x, one.pose.position.y) for one in poses])
     if not np.isfinite(xy).all():
         raise OmnidError("a position is not finite; check the sender")
-    return PlanarPath(_stamp_ns(message), message.header.frame_id, xy, _planar_heading(poses[-1].pose))
+    # 2. The heading at the end, which a quaternion of zeros does not ask for.
+    last, heading_rad = poses[-1].pose, None
+    q = last.orientation
+    if any((q.x, q.y, q.z, q.w)):
+        T = _rigid_transform(last)
+        if T[2, 2] < 0.5:  # tilted by 60 degrees: what was meant is not a turn about z
+            raise OmnidError(f"orientation {q.x, q.y, q.z, q.w}: expected a turn about z, or all zeros")
+        heading_rad = float(se3.yaw(T))
+    return PlanarPath(stamp_of(message.header), message.header.frame_id, xy, heading_rad)
 
 
 def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> Values:
     half_rad = 0.0 if heading_rad is None else 0.5 * heading_rad
     w = 0.0 if heading_rad is None else math.cos(half_rad)
     return (x_m, y_m, 0.0), (0.0, 0.0, math.sin(half_rad), w)
-
-
-def _planar_heading(pose: Any) -> float | None:
-    q = pose.orientation
-    if not any((q.x, q.y, q.z, q.w)):
-        return None
-    T = _rigid_transform(pose)
-    if T[2, 2] < 0.5:  # tilted by 60 degrees: what was meant is not a turn about z
-        raise OmnidError(f"orientation {q.x, q.y, q.z, q.w}: expected a turn about z, or all zeros; check the sender")
-    return float(se3.yaw(T))
 
 
 # Images.
@@ -595,4 +581,4 @@ class Panorama:
 def decode_panorama(payload: bytes, _: bytes = b"") -> Panorama:
     """Decode a CompressedImage."""
     message = decoded(payload, IMAGE_SCHEMA)
-    return Panorama(_stamp_ns(message), message.data.tobytes())
+    return Panorama(stamp_of(message.header), message.data.tobytes())

@@ -21,13 +21,12 @@ import re
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 from typing import Final, TypeAlias
 
-from drivers.motion import MotionSample
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
@@ -137,9 +136,7 @@ class CommandReceiver:
         is_unique: Callable[[], bool] = lambda: True,
         navigate: Callable[[requests.NavigationCommand], None] | None = None,
         save_map: Callable[[int], object] | None = None,
-        take_sample: Callable[[MotionSample], None] = lambda _: None,
-        decode_sample: Callable[[bytes, str], MotionSample | None] = lambda *_: None,
-        sensors: Collection[str] = (),
+        sensors: Mapping[str, Callable[[bytes], object]] = MappingProxyType({}),
         why_not: Mapping[str, str] = MappingProxyType({}),
         report: Callable[[str], None] = lambda _: None,
     ) -> None:
@@ -148,9 +145,9 @@ class CommandReceiver:
         controller: None without wheels. sources: names; the first has the short topics cmd/twist and cmd/heading, too.
         is_unique: False while another robot has this one's name, which is then not armed. navigate: takes requests;
         None: there is no navigation. save_map: takes the id of a request to save the map; None: it is in no file.
-        take_sample, decode_sample: of the topics in sensors, by bytes and type. why_not: the remedy for topics that
-        have no action. report: takes a line for the log where a refusal is another one than before. All are called
-        from any thread.
+        sensors: take the bytes of samples, by topic; OmnidError for others. why_not: the remedy for topics that have no
+        action. report: takes a line for the log where a refusal is another one than before. All are called from any
+        thread.
         """
         self._freshness, self._is_unique, self._why_not, self._report = freshness, is_unique, why_not, report
         self.wheels, self.requests, self.samples = MessageCounts(), MessageCounts(), MessageCounts()
@@ -168,7 +165,8 @@ class CommandReceiver:
             self._actions |= dict.fromkeys(topics.NAVIGATION_TOPICS, partial(self._ask, navigate))
         if save_map is not None:
             self._actions[topics.MAP] = partial(self._save, save_map)
-        self._actions |= dict.fromkeys(sensors, partial(self._sample, take_sample, decode_sample))
+        for topic, take in sensors.items():
+            self._actions[topic] = partial(_take_payload, take)
         self._stop_ns = 0  # arrival of the newest stop
         self._touched_ns = dict.fromkeys(CONTACTS.values(), 0)  # when the newest contact was sent, or arrived before
         # Sender and newest arrival of the setpoints of each source: the first one begins a motion, the others go on
@@ -217,7 +215,7 @@ class CommandReceiver:
         self._controller.touch(contact, holds=holds)
 
     def _arm(self, request: Request, arrival_ns: int) -> None:
-        stamp_ns = codec.header_stamp_ns(codec.decoded(request.payload, codec.HEADER_SCHEMA))
+        stamp_ns = codec.stamp_of(codec.decoded(request.payload, codec.HEADER_SCHEMA))
         sent_ns = self._freshness.require(request, arrival_ns, stamp_ns)
         if not self._is_unique():
             raise Refused("another robot has this name", "change bus.robot of one of them")
@@ -257,17 +255,9 @@ class CommandReceiver:
             raise OmnidError(f'a String "{topics.SAVE_MAP}" was expected')
         save_map(request.id)
 
-    def _sample(
-        self,
-        take: Callable[[MotionSample], None],
-        decode: Callable[[bytes, str], MotionSample | None],
-        request: Request,
-        _: int,
-    ) -> None:
-        sample = decode(request.payload, topics.command_of(request.topic).schema)
-        if sample is not None:
-            self.samples.accepted += 1
-            take(sample)
+
+def _take_payload(take: Callable[[bytes], object], request: Request, _: int) -> None:
+    take(request.payload)
 
 
 def _twist_command(payload: bytes) -> tuple[int, Setpoint]:

@@ -30,15 +30,15 @@ def type_hash(schema: str) -> str:
     return str(get_typestore(Stores.ROS2_HUMBLE).hash_rihs01(schema))
 
 
-def dds_type(schema: str) -> str:
-    """Return the DDS name of a type such as nav_msgs/msg/Odometry."""
+def _type_key(schema: str) -> str:
+    """Return the part of a key with the DDS name of a type such as nav_msgs/msg/Odometry, and its hash."""
     package, kind, name = schema.split("/")
-    return f"{package}::{kind}::dds_::{name}_"
+    return f"{package}::{kind}::dds_::{name}_/{type_hash(schema)}"
 
 
 def data_key(domain: int, topic: str, schema: str) -> str:
     """Return the zenoh key of a topic with rmw_zenoh; topic with its leading '/'."""
-    return f"{domain}{topic}/{dds_type(schema)}/{type_hash(schema)}"
+    return f"{domain}{topic}/{_type_key(schema)}"
 
 
 class Attachment(NamedTuple):
@@ -82,9 +82,9 @@ class RosNode:
         self._tokens: list[zenoh.LivelinessToken] = []
         self._declare(f"{self._prefix}/0/NN/%/%/{self._name}")
 
-    def publisher(self, topic: str, schema: str, *, transient_local: bool) -> str:
+    def publisher(self, topic: str, schema: str, *, latched: bool) -> str:
         """Declare a publisher of a robot's topic and return its token."""
-        return self._endpoint("MP", topic, schema, TRANSIENT_LOCAL if transient_local else RELIABLE_LAST_10)
+        return self._endpoint("MP", topic, schema, TRANSIENT_LOCAL if latched else RELIABLE_LAST_10)
 
     def subscription(self, topic: str, schema: str) -> None:
         """Declare a subscription of a robot's topic."""
@@ -93,7 +93,7 @@ class RosNode:
     def _endpoint(self, kind: str, topic: str, schema: str, quality: str) -> str:
         name = ros_name(self._robot, topic).replace("/", "%")
         where = f"{self._prefix}/{next(self._entities)}/{kind}/%/%/{self._name}"
-        return self._declare(f"{where}/{name}/{dds_type(schema)}/{type_hash(schema)}/{quality}")
+        return self._declare(f"{where}/{name}/{_type_key(schema)}/{quality}")
 
     def _declare(self, token: str) -> str:
         if self._is_on:

@@ -10,14 +10,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import time
 from importlib.resources import files
 from typing import Any, Final
 
 import zenoh
 
 from omnid.errors import OmnidError
-from omnid.plain_text import plain
 from omnid.transport.bus_config import KEY, BusConfig
 
 HERE: Final = "tcp/127.0.0.1:7447"
@@ -25,7 +23,8 @@ ALIVE: Final = "alive"  # key of the liveliness token below the robot's name
 _ROS_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PROTOCOLS: Final = "transport/link/protocols"
-QUERY_S: Final = 1.0  # A query without an answer ends after this time, and a client tries again to connect.
+PERIOD_S: Final = 0.004  # time between two looks at what has no wait with a timeout
+CONNECT_S: Final = 2.0  # A connection is complete, and a query is answered, within this time.
 # zenoh's threads (zenoh-runtime): what one robot receives needs one, and accepting links none of its own.
 _THREADS: Final = "(rx: (worker_threads: 1), acc: (handover: app))"
 _DEFAULTS: Final = (  # what zenoh's own file may leave to default.json5
@@ -64,28 +63,14 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
         ) from error
 
 
-def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
+def open_client(given: BusConfig) -> zenoh.Session:
     """Open the session of a program that listens to robots and commands them; bus.listen does not count.
 
-    Raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings.
+    Raise Unreachable where no endpoint answers within CONNECT_S, OmnidError for wrong settings.
     """
     # Peers that only share a router exchange no messages, clients do.
     config = BusConfig(robot=given.robot, listen=(), connect=given.connect or (HERE,), config=given.config)
-    deadline_s = time.monotonic() + timeout_s
-    while True:
-        try:
-            return open_session(config, guarded=False)
-        except Unreachable:
-            if time.monotonic() >= deadline_s:
-                raise
-        time.sleep(QUERY_S)
-
-
-def robots_there(session: zenoh.Session) -> str:
-    """Return the names of the robots that a session reaches, as a part of a sentence."""
-    replies = session.liveliness().get(f"**/{ALIVE}", timeout=QUERY_S)
-    names = sorted(str(reply.ok.key_expr).rpartition("/")[0] for reply in replies if reply.ok is not None)
-    return plain(f"robots there: {', '.join(names)}") if names else "no robot is there"
+    return open_session(config, guarded=False)
 
 
 def has_receiver(declared: zenoh.Publisher | zenoh.Querier) -> bool:
@@ -114,7 +99,9 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
         "connect/exit_on_failure": config.is_client,
     }
     if config.is_client:
-        endpoints["connect/timeout_ms"] = 1000  # a client that cannot reach its router opens no session
+        endpoints["connect/timeout_ms"] = round(
+            1000 * CONNECT_S
+        )  # a client that cannot reach its router opens no session
     try:
         for key, value in endpoints.items():
             result.insert_json5(key, json.dumps(value))

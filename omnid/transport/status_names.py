@@ -26,7 +26,7 @@ from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, deco
 PREFIX: Final = "omnid: "
 ODOMETRY: Final = f"{PREFIX}odometry"
 PAIRING: Final = f"{PREFIX}pairing"
-CAMERAS: Final = f"{PREFIX}cameras"  # the advice for both; their entries are named by camera_name
+CAMERAS: Final = f"{PREFIX}cameras"  # the advice for both; their entries end with " camera"
 WHEELS: Final = f"{PREFIX}wheels"
 BUS: Final = f"{PREFIX}bus"
 CLOCK: Final = f"{PREFIX}clock"  # of the computer, whose steps the stamps follow
@@ -93,15 +93,6 @@ class Key(StrEnum):
     DISARMED_BY = "disarmed_by"  # the reason, no key while armed; DISARMED_BY_STOP after a stop
     REMEDY = "remedy"  # what to do, such as the way to arm; no key where nothing is needed
     REAL_TIME_FACTOR = "real_time_factor"  # simulated time over time on the wall
-    # Navigation
-    TASK = "task"  # such as "goal" or "route NAME"; no key without one
-    REASON = "reason"  # of a halt or an end
-    COMMAND_NS = "command_ns"  # stamp of the request that the task follows from; no key without one
-    LEFT_M = "left_m"  # way to the end of the path
-    TEACHING = "teaching"  # name of the route that is recorded
-    TAUGHT_M = "taught_m"
-    REQUEST = "request"  # the newest one, in a word
-    REFUSAL = "refusal"  # why it is refused; no key where it was accepted
 
 
 # Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms.
@@ -157,11 +148,6 @@ def times(name: str, histogram: Histogram) -> dict[str, float]:
     return {time_key(name, statistic): value_ms for statistic, value_ms in histogram.times_ms().items()}
 
 
-def camera_name(camera: str) -> str:
-    """Return the name of a camera's entry."""
-    return f"{PREFIX}{camera} camera"
-
-
 def stage_name(stage: str) -> str:
     """Return the name of a stage's entry."""
     return f"{STAGE_PREFIX}{stage}"
@@ -194,7 +180,10 @@ def tracking_state(message: str, values: Mapping[str, str]) -> TrackingState | N
 
 @dataclass(frozen=True, slots=True)
 class NavigationReport:
-    """State of goals, paths and routes; see omnid.navigation_state for the states."""
+    """State of goals, paths and routes; see omnid.navigation_state for the states.
+
+    The fields are keys of the entry NAVIGATION, which has none for what is unknown or empty.
+    """
 
     stamp_ns: int = 0
     state: str = ""

@@ -25,7 +25,6 @@ STOPPED: Final = "stopped"  # the robot is disarmed by a stop
 REPEAT_S: Final = 0.05
 MOST_PER_PASS: Final = 16  # Most datagrams that one pass reads of a socket during a flood.
 _HEAD: Final = b"omnid stop 1 "
-_LONGEST: Final = 512  # bytes
 _REQUEST: Final = re.compile(rb"omnid stop 1 ([0-9a-f]{16}) ([!-~]{1,256}) *")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls|ws)/(.+):(\d{1,5})(?:[?#].*)?")  # those whose UDP port is free
 
@@ -44,6 +43,7 @@ class StopListener:
     def __init__(self, config: BusConfig, on_stop: Callable[[], None], is_stopped: Callable[[], bool]) -> None:
         """on_stop: called for each request. is_stopped: True if the robot is disarmed by a stop."""
         self._robot, self._on_stop, self._is_stopped = config.robot.encode(), on_stop, is_stopped
+        self._longest = len(_request(config.robot)) + 1  # of more than a request is none
         own, proves = ("localhost", "127.0.0.1", "::1"), needs_proof(config)
         found = [(host if host in own or not proves else own[1], port) for host, port in addresses(config.listen)]
         self._sockets = _sockets(found, listens=True)
@@ -57,7 +57,7 @@ class StopListener:
         for listener in self._sockets:
             for _ in range(MOST_PER_PASS):
                 with suppress(OSError):  # there is no more, or an earlier answer could not be delivered
-                    data, sender = listener.recvfrom(_LONGEST)
+                    data, sender = listener.recvfrom(self._longest)
                     found = _REQUEST.fullmatch(data)
                     if found is not None and found[2] == self._robot:
                         self._on_stop()
@@ -74,10 +74,9 @@ class StopSender:
     """The client of a stop: it asks all endpoints at the same time."""
 
     def __init__(self, robot: str, endpoints: Sequence[str]) -> None:
-        nonce = secrets.token_hex(8).encode()
-        # No answer is longer than its request.
-        self._request = _HEAD + nonce + b" " + robot.encode() + b" " * len(STOPPED)
-        self._answers = {_HEAD + nonce + b" " + state.encode(): state for state in (ASKED, STOPPED)}
+        self._request = _request(robot)
+        head = self._request[: -len(robot.encode()) - len(STOPPED)]
+        self._answers = {head + state.encode(): state for state in (ASKED, STOPPED)}
         self._sockets = _sockets(addresses(endpoints), listens=False)
 
     def ask(self, wait_s: float) -> str:
@@ -91,7 +90,7 @@ class StopSender:
             for sender in self._sockets:
                 with suppress(OSError):  # there is no more, or no program listens there
                     for _ in range(MOST_PER_PASS):
-                        answer = self._answers.get(sender.recv(_LONGEST), answer)
+                        answer = self._answers.get(sender.recv(len(self._request)), answer)
             if time.monotonic() >= deadline_s:
                 break
         return answer
@@ -100,6 +99,11 @@ class StopSender:
         """Close the sockets."""
         for sender in self._sockets:
             sender.close()
+
+
+def _request(robot: str) -> bytes:
+    """Return a request with a new nonce; no answer is longer."""
+    return _HEAD + secrets.token_hex(8).encode() + b" " + robot.encode() + b" " * len(STOPPED)
 
 
 def _sockets(found: Iterable[tuple[str, int]], *, listens: bool) -> list[socket.socket]:

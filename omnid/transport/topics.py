@@ -21,7 +21,6 @@ MAP_POSE: Final = "map_pose"
 SCAN: Final = "scan"
 PANORAMA: Final = "panorama"
 CLOCK: Final = "/clock"  # Time of runs whose clock is not the computer's.
-EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
 
 
 def _not_read(payload: bytes, attachment: bytes = b"") -> None:
@@ -91,7 +90,7 @@ _request = partial(Command, rate_hz=50.0, is_request=True)
 # Samples are below `cmd`, too, because they move the pose while the cameras show nothing: only programs that may
 # command the robot may write them.
 COMMANDS: Final = {
-    STOP: Command(EMPTY_SCHEMA, longest=sys.maxsize),  # anything
+    STOP: Command("std_msgs/msg/Empty", longest=sys.maxsize),  # anything
     ARM: _request(codec.HEADER_SCHEMA),  # with the time it was sent
     **dict.fromkeys((BUMPER, CLIFF), Command(codec.BOOL_SCHEMA)),  # all but a fresh False is a contact
     GOAL: _request(codec.POSE_SCHEMA),  # in map or odom; a quaternion of zeros asks for no heading

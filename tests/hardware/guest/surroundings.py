@@ -15,7 +15,7 @@ from typing import NamedTuple
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.log_camera import LogImages
 from drivers.frame import Camera
-from omnid.client import Diagnostics, Pose, Robot
+from omnid.client import Diagnostics, Pose, Robot, Unreachable
 from omnid.transport.codec import decode_diagnostics, decode_pose
 
 SYSTEMD = Path("/opt/omnid/systemd")
@@ -125,7 +125,14 @@ class GuestOperator:
         self.poses: list[Pose] = []
         self.report: Diagnostics | None = None
         self.driving = False
-        self._robot = Robot(timeout_s=60.0)
+        deadline_s = time.monotonic() + 60.0
+        while True:
+            try:
+                self._robot = Robot()
+                break
+            except Unreachable:
+                if time.monotonic() > deadline_s:
+                    raise
         self._robot.on_message(self._take)
         self._leaving = threading.Event()
         self._thread = threading.Thread(target=self._drive, daemon=True)

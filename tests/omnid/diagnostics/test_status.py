@@ -15,7 +15,7 @@ from calib.rig import Rig
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
-from omnid.camera_config import PairConfig
+from omnid.config import PairConfig
 from omnid.controller.controller import Controller
 from omnid.controller.link import ControllerStatistics
 from omnid.core.control.arming import ArmRequest

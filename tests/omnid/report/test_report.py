@@ -29,7 +29,7 @@ from omnid.report.report import report_html
 from omnid.runs.session import attached_rig
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, Key, camera_name, stage_name
+from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, Key, stage_name
 
 TERMINAL = "x\x1b[31m\x07\x9b2J"
 EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
@@ -102,7 +102,7 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
 
 
 def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> None:
-    camera = camera_name("upper")
+    camera = "omnid: upper camera"
     entries = [
         status(-20, DiagnosticStatus(ODOMETRY, 3, "no pose yet", {}), DiagnosticStatus(PAIRING, 1, "none", {})),
         *run(100, lost=range(80, 85), missing=range(30, 50)),

@@ -174,7 +174,7 @@ def test_a_taken_or_silent_endpoint_is_refused_with_the_setting_to_change() -> N
     with pytest.raises(Unreachable, match=r"change bus.connect"):
         Robot(connect=(endpoint,))
     with pytest.raises(OmnidError, match="an example is") as wrong:
-        open_client(BusConfig(connect=("nowhere",)), timeout_s=60.0)
+        open_client(BusConfig(connect=("nowhere",)))
     assert not isinstance(wrong.value, Unreachable)
 
 
@@ -211,16 +211,8 @@ ODOMETRY_KEY = (
     "0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
     "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"
 )
-HASHES = {  # as published by ROS 2's own type description service, first digits
-    "std_msgs/msg/String": "df668c74",
-    "nav_msgs/msg/Odometry": "3cc97dc7",
-    "geometry_msgs/msg/PoseStamped": "10f3786d",
-    "sensor_msgs/msg/PointCloud2": "9198cabf",
-    "tf2_msgs/msg/TFMessage": "e369d0f0",
-    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36ef",
-    "sensor_msgs/msg/CompressedImage": "15640771",
-    "geometry_msgs/msg/TwistStamped": "5f0fcd4f",
-}
+# As published by ROS 2's own type description service, first digits; Odometry's is in ODOMETRY_KEY.
+HASHES = {"std_msgs/msg/String": "df668c74", "tf2_msgs/msg/TFMessage": "e369d0f0"}
 PACE_S = 0.01  # between messages, so that a reader which is slow for a moment has them all
 
 
@@ -288,13 +280,12 @@ def test_of_a_stop_and_a_request_to_arm_in_one_pass_the_stop_wins() -> None:
     with robot() as (bus, program, received):
         driver = program.driver()
         wait_until(lambda: driver.connected)
-        assert bus._commands is not None
         bus._pollers[-2].close()  # the passes are made here
         stop, ask = program._session.put, program._session.get
         stop("omnid/cmd/stop", b"")
         reply = ask("omnid/@request/arm", payload=codec.header_cdr(time.time_ns()), timeout=5.0)
         time.sleep(0.5)
-        bus._commands.process()
+        bus._take_commands()
         assert [request.topic for request in received] == ["cmd/stop", "cmd/arm", "cmd/stop"]
         del reply
 
@@ -351,8 +342,8 @@ def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> N
             assert commands[topic] - before <= 2 * max(4, rate_hz / 4) + rate_hz * (time.monotonic() - begin_s)
 
 
-@pytest.mark.parametrize("answer", [Answer(True, "driving"), Answer(False, "not armed: d\u00e9sarm\u00e9\n" * 50)])
-def test_a_request_gets_the_answer_that_is_given_later(answer: Answer) -> None:
+def test_a_request_gets_the_answer_that_is_given_later() -> None:
+    answer = Answer(False, "not armed: d\u00e9sarm\u00e9\n" * 50)
     with robot() as (bus, program, received), ThreadPoolExecutor(1) as thread:
         asked = thread.submit(program.driver().route, "repeat hall")
         wait_until(lambda: bool(received))

@@ -27,7 +27,7 @@ from omnid.transport import codec
 from omnid.transport.codec import BOOL_SCHEMA, encoded, goal_cdr, path_cdr, string_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
 from omnid.transport.sensor_codec import gyro_cdr, sample_from_cdr, wheel_cdr
-from omnid.transport.topics import IMU, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request
+from omnid.transport.topics import IMU, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request, command_of
 from tests.omnid.transport.bus_fixtures import damaged
 from tests.set_clock import SetClock
 
@@ -489,13 +489,14 @@ def test_damaged_messages_never_raise_and_lead_to_finite_goals() -> None:
 
 
 def receiver(taken: list[MotionSample], lines: list[str], *sensors: str) -> CommandReceiver:
+    def take(topic: str, payload: bytes) -> None:
+        sample = sample_from_cdr(payload, command_of(topic).schema, stamp_of, JointWheels("left", "right", 0.1, 0.5))
+        assert sample is not None
+        taken.append(sample)
+
+    used = {topic: partial(take, topic) for topic in sensors or SENSOR_TOPICS}
     return CommandReceiver(
-        Freshness(STALE_S),
-        take_sample=taken.append,
-        decode_sample=partial(sample_from_cdr, stamp_ns=stamp_of, joints=JointWheels("left", "right", 0.1, 0.5)),
-        sensors=sensors or SENSOR_TOPICS,
-        why_not={WHEEL_ODOM: "see motion.wheels"},
-        report=lines.append,
+        Freshness(STALE_S), sensors=used, why_not={WHEEL_ODOM: "see motion.wheels"}, report=lines.append
     )
 
 
