@@ -136,16 +136,13 @@ def draw_plan(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32], lines:
 
 
 def draw_ends(image: Image, sheet: Sheet, start: Array, end: Array | None = None) -> None:
-    """Draw a circle with its name at the start of a path, and a square with its name at its end."""
-    if end is not None:
-        x, y = sheet.pixel(end)
-        for colour, half_px in ((WHITE, MARK_PX // 2 + 1), (BLACK, MARK_PX // 2)):
-            cv2.rectangle(image, (x - half_px, y - half_px), (x + half_px, y + half_px), colour, cv2.FILLED)
-        write(image, "end", (x, y + 2 * MARK_PX))
-    x, y = sheet.pixel(start)
-    for colour, radius_px in ((BLACK, MARK_PX - 2), (WHITE, MARK_PX // 2)):
-        cv2.circle(image, (x, y), radius_px, colour, cv2.FILLED, cv2.LINE_AA)
-    write(image, "start", (x, y - MARK_PX))
+    """Draw a circle with its name at the start of a path, and one that is filled at its end."""
+    for point, name, inside in ((end, "end", BLACK), (start, "start", WHITE)):
+        if point is not None:
+            x, y = sheet.pixel(point)
+            cv2.circle(image, (x, y), MARK_PX - 2, BLACK, cv2.FILLED, cv2.LINE_AA)
+            cv2.circle(image, (x, y), MARK_PX // 2, inside, cv2.FILLED, cv2.LINE_AA)
+            write(image, name, (x, y - MARK_PX if name == "start" else y + 2 * MARK_PX))
 
 
 def _cells(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32]) -> Image:
@@ -165,28 +162,18 @@ def _cells(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32]) -> Image:
 
 
 def _draw_frame(image: Image, sheet: Sheet) -> None:
-    """Draw the border, ticks in metres on two sides, the names of the axes and a scale bar."""
-    # The longest tick of 1, 2 or 5 times a power of ten whose spacing is not much more than a label's width.
+    """Draw the border, the names of the axes and a scale bar."""
+    # The longest bar of 1, 2 or 5 times a power of ten that is not much longer than its label.
     longest_m = 2 * MARGIN_PX / sheet.px_per_m
     decade = 10.0 ** np.floor(np.log10(longest_m))
-    step_m = float(decade * max(digit for digit in (1, 2, 5) if digit * decade <= longest_m))
+    bar_m = float(decade * max(digit for digit in (1, 2, 5) if digit * decade <= longest_m))
     (left, bottom), (right, top) = sheet.pixel(sheet.low_m), sheet.pixel(sheet.high_m)
-    half_px = MARK_PX // 2
-    for axis in (0, 1):
-        first, last = np.ceil(sheet.low_m[axis] / step_m), np.floor(sheet.high_m[axis] / step_m)
-        for value_m in step_m * np.arange(first, last + 1):
-            at, label = sheet.low_m.copy(), f"{value_m + 0.0:g}"  # no -0
-            at[axis] = value_m
-            x, y = sheet.pixel(at)
-            to, label_at = ((x, y + half_px), (x, y + 2 * MARK_PX)) if axis == 0 else ((x - half_px, y), None)
-            cv2.line(image, (x, y), to, BLACK, 1)
-            write(image, label, label_at or (x - MARK_PX - half_px * len(label), y + half_px))
     cv2.rectangle(image, (left, top), (right, bottom), BLACK, 1)
-    write(image, "x forward [m]", ((left + right) // 2, bottom + MARGIN_PX - 2 * MARK_PX))
-    write(image, "y left [m]", (left, top - MARK_PX))
-    bar, y = right - round(step_m * sheet.px_per_m), MARGIN_PX - MARK_PX
-    cv2.rectangle(image, (bar, y - half_px), (right, y), BLACK, cv2.FILLED)
-    write(image, f"{step_m:g} m", ((bar + right) // 2, y - MARK_PX))
+    write(image, "x forward", ((left + right) // 2, bottom + 2 * MARK_PX))
+    write(image, "y left", (left, top - MARK_PX))
+    bar, y = right - round(bar_m * sheet.px_per_m), MARGIN_PX - MARK_PX
+    cv2.rectangle(image, (bar, y - MARK_PX // 2), (right, y), BLACK, cv2.FILLED)
+    write(image, f"{bar_m:g} m", ((bar + right) // 2, y - MARK_PX))
 
 
 def with_legend(image: Image, lines: Sequence[tuple[str, Colour, int]]) -> Image:

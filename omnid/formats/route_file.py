@@ -20,40 +20,31 @@ from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_whole
 
-FORMAT: Final = "omnid route"
 VERSION: Final = 1
 SUFFIX: Final = ".route.json"
-# Limits of what is read, so that any file is refused in bounded time and memory. The longest route that can be taught
-# has MOST_POINTS points and one keyframe at most for each of them, which is less than 4 MB.
+# Limit of what is read: the longest route that can be taught, of MOST_POINTS points, has less than 4 MB.
 MAX_BYTES: Final = 8 << 20
 _PARTS: Final = ("x_m", "y_m", "yaw_rad")
 COLUMNS: Final = [*_PARTS, "speed_mps", "keyframe", *(f"in_keyframe_{part}" for part in _PARTS)]
-_NO_ROUTE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)  # raised for bytes that are none
 
-_Position: TypeAlias = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
-_Yaw: TypeAlias = Annotated[float, Meta(ge=-1e4, le=1e4)]
-_Speed: TypeAlias = Annotated[float, Meta(ge=-20.0, le=20.0)]  # no robot on wheels has another
-_Number: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
+_Number: TypeAlias = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
+_Count: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
 _Keyframe: TypeAlias = Annotated[int, Meta(ge=NO_KEYFRAME, lt=1 << 62)]
-_Point: TypeAlias = tuple[_Position, _Position, _Yaw, _Speed, _Keyframe, _Position, _Position, _Yaw]  # the COLUMNS
+# The COLUMNS.
+_Point: TypeAlias = tuple[_Number, _Number, _Number, _Number, _Keyframe, _Number, _Number, _Number]
 
 
-class _Head(Struct):
-    """The part of each version by which a reader knows whether it can read the file."""
+class _Content(Struct, forbid_unknown_fields=True):
+    """A file."""
 
     format: Literal["omnid route"]
-    version: int
-
-
-class _Content(_Head, forbid_unknown_fields=True):
-    """A file of this version."""
-
+    version: Literal[1]
     name: str
     created_s: Annotated[int, Meta(ge=0, lt=1 << 40)]
-    map: Annotated[str, Meta(max_length=4096)]
-    columns: Annotated[list[str], Meta(max_length=len(COLUMNS))]
+    map: str
+    columns: list[str]
     points: Annotated[list[_Point], Meta(min_length=2, max_length=MOST_POINTS)]
-    keyframes: Annotated[list[tuple[_Number, _Number]], Meta(max_length=MOST_POINTS)]  # id, stamp [ns]
+    keyframes: Annotated[list[tuple[_Count, _Count]], Meta(max_length=MOST_POINTS)]  # id, stamp [ns]
     crc32: int
 
     def checksum(self) -> int:
@@ -78,15 +69,9 @@ def route_bytes(route: Route) -> bytes:
 
 def parse_route(content: bytes, name: str) -> Route:
     """Return the route of a file; name: for errors. Raise OmnidError for any other bytes."""
-    if len(content) > MAX_BYTES:
-        raise OmnidError(f"{name}: {len(content) >> 20} MB: expected a route of at most {MAX_BYTES >> 20} MB")
     try:
-        version = msgspec.json.decode(content, type=_Head).version
-    except _NO_ROUTE:
-        raise OmnidError(f'{name}: this is no route file: expected JSON with "format": "{FORMAT}"') from None
-    if version != VERSION:
-        raise OmnidError(f"{name}: this is a route of version {version}, expected {VERSION}: teach it again, or update")
-    try:
+        if len(content) > MAX_BYTES:
+            raise OmnidError(f"it has more than {MAX_BYTES >> 20} MB")
         found = msgspec.json.decode(content, type=_Content)
         if found.columns != COLUMNS:
             raise OmnidError(f"expected the columns {', '.join(COLUMNS)}")
@@ -95,8 +80,9 @@ def parse_route(content: bytes, name: str) -> Route:
         numbers, keyframes = np.array(found.points, np.float64), np.array([point[4] for point in found.points])
         points = numbers[:, :3], numbers[:, 3], keyframes, numbers[:, 5:]
         return Route(route_name(found.name), *points, dict(found.keyframes), found.created_s, found.map)
-    except (*_NO_ROUTE, OmnidError) as error:
-        raise OmnidError(f"{name}: the route is damaged: {error}: teach it again") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OmnidError) as error:
+        what = f"this is no route of version {VERSION}, or a damaged one"
+        raise OmnidError(f"{name}: {what}: {error}: teach it again") from None
 
 
 class RouteFolder:
@@ -111,9 +97,7 @@ class RouteFolder:
 
     def names(self) -> list[str]:
         """Return the names of all routes, sorted."""
-        return sorted(
-            path.name.removesuffix(SUFFIX) for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(".")
-        )
+        return sorted(path.name.removesuffix(SUFFIX) for path in self.folder.glob(f"[!.]*{SUFFIX}"))
 
     def has(self, name: str) -> bool:
         """True if there is a file for a route of that name, readable or not."""
@@ -121,9 +105,8 @@ class RouteFolder:
 
     def read(self, name: str) -> Route:
         """Return a route. Raise OmnidError where there is none, or where its file is damaged."""
-        path, known = self.path(name), ", ".join(self.names()[:20]) or "none"
-        absent = f"no route {name} in {self.folder}: there are: {known}"
-        with self._reported(path, "read the route", absent), path.open("rb") as file:
+        path = self.path(name)
+        with self._reported(path, "read the route"), path.open("rb") as file:
             content = file.read(MAX_BYTES + 1)
         route = parse_route(content, str(path))
         if route.name != name:
@@ -137,10 +120,10 @@ class RouteFolder:
         write_whole(self.path(route.name), route_bytes(route))
 
     @contextmanager
-    def _reported(self, path: Path, action: str, absent: str = "") -> Iterator[None]:
-        """Turn what the disk says into OmnidError; absent: the error where there is no such file."""
+    def _reported(self, path: Path, action: str) -> Iterator[None]:
+        """Turn what the disk reports into OmnidError, which names the routes that are there."""
         try:
             yield
         except OSError as error:
-            is_absent = isinstance(error, FileNotFoundError) and absent
-            raise OmnidError(absent if is_absent else f"{path}: cannot {action}: {error.strerror or error}") from None
+            known = ", ".join(self.names()[:20]) or "none"
+            raise OmnidError(f"{path}: cannot {action}: {error.strerror or error}; routes there: {known}") from None

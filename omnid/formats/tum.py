@@ -53,7 +53,7 @@ def read_tum(path: str | Path) -> Trajectory:
     try:
         for line, content in enumerate(_lines(Path(path)), start=1):
             data, _, comment = content.partition("#")
-            words = _words(data)
+            words = data.replace(",", " ").split()
             is_head = len(words) > 1 and not any(re.match(r"[-+.]?[0-9]", word) for word in words)
             if words and (found or not is_head):
                 # Tables may have more columns, such as velocities.
@@ -63,20 +63,15 @@ def read_tum(path: str | Path) -> Trajectory:
                 order = _quaternion_order(data if words else comment) or order
     except ValueError as error:
         raise OmnidError(f"{path}, line {line}: {error}") from error
-    if not found:
-        raise OmnidError(f"{path}: no pose found: expected lines 't x y z qx qy qz qw'")
     # 2. Sorted by stamp, each once.
     found.sort(key=lambda pose: pose[0])
+    if not found:
+        raise OmnidError(f"{path}: no pose found: expected lines 't x y z qx qy qz qw'")
     for (before_ns, first, _), (stamp_ns, second, _) in pairwise(found):
         if before_ns == stamp_ns:
-            raise OmnidError(
-                f"{path}, line {second}: expected each stamp once, found that of line {first} again: remove one of the "
-                "two"
-            )
+            raise OmnidError(f"{path}, line {second}: its stamp is that of line {first}: remove one of the two")
     xyz, q = np.split(np.array([pose for *_, pose in found]), [len(_AXES)], axis=1)
-    q = q[:, [order.index(name) for name in _QUATERNION]]
-    # The division keeps squares in se3 from overflowing.
-    T = se3.transform(se3.rotation(q / np.abs(q).max(axis=1, keepdims=True)), xyz)
+    T = se3.transform(se3.rotation(q[:, [order.index(name) for name in _QUATERNION]]), xyz)
     stamps_ns = np.array([stamp_ns for stamp_ns, *_ in found], np.int64)
     stamps_ns.setflags(write=False)
     T.setflags(write=False)
@@ -106,14 +101,10 @@ def _lines(path: Path) -> list[str]:
     return raw.decode("utf-8-sig", "replace").split("\n")
 
 
-def _words(data: str) -> list[str]:
-    """Return the words of a line, separated by spaces or commas."""
-    return data.replace(",", " ").split()
-
-
 def _quaternion_order(head: str) -> list[str] | None:
     """Return the order of the quaternion; None unless a head names time, position, quaternion."""
-    axes = [name[-1] for name in _words(re.sub(r"\[[^\]]*\]", "", head).lower())[1:8]]
+    names = re.sub(r"\[[^\]]*\]", "", head).lower().replace(",", " ").split()
+    axes = [name[-1] for name in names[1:8]]
     order = axes[len(_AXES) :]
     return order if axes[: len(_AXES)] == _AXES and sorted(order) == sorted(_QUATERNION) else None
 
@@ -126,20 +117,13 @@ def _row(words: list[str]) -> tuple[int, list[float]]:
     # Not by float64, whose resolution at Unix times is 238 ns. adjusted() comes first: 1e999999999 has no end.
     places = 0 if re.fullmatch(r"\d{16,19}", words[0]) else _DECIMALS
     try:
-        stamp = Decimal(words[0])
-    except InvalidOperation:
-        stamp = Decimal("nan")
+        stamp, pose = Decimal(words[0]), np.array(words[1:], float)
+    except (InvalidOperation, ValueError):
+        raise ValueError(f"expected numbers, found {found}") from None
     if not stamp.is_finite() or stamp.adjusted() + places > 21 or abs(stamp.scaleb(places)) >= STAMP_LIMIT_NS:
         raise ValueError(f"expected a stamp in seconds, found {words[0][:_SHOWN]!r}")
-    try:
-        pose = np.array([float(word) for word in words[1:]])
-    except ValueError:
-        pose = np.array(np.nan)
-    if not np.isfinite(pose).all():
-        raise ValueError(f"expected finite numbers, found {found}")
-    xyz, q = np.split(np.abs(pose), [len(_AXES)])
-    if xyz.max() > POSITION_LIMIT_M:
-        raise ValueError(f"expected a position within {POSITION_LIMIT_M:g} m, found {found}")
-    if q.max() < 1 / POSITION_LIMIT_M:
-        raise ValueError(f"expected a unit quaternion, found zero: {found}")
+    size, norm = np.abs(pose).max(), np.abs(pose[len(_AXES) :]).max()
+    # Negated, so that what is not finite is refused as well.
+    if not (size <= POSITION_LIMIT_M and norm >= 1 / POSITION_LIMIT_M):
+        raise ValueError(f"expected numbers within {POSITION_LIMIT_M:g} m, and a unit quaternion, found {found}")
     return int(stamp.scaleb(places).to_integral_value()), pose.tolist()

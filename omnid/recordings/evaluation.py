@@ -66,10 +66,9 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
     Each estimate is associated with the truth nearest in time within the tolerance; of two estimates with the same
     truth, the nearer one. Raise OmnidError for fewer than two associated poses.
     """
-    if alignment not in ALIGNMENTS:
-        raise OmnidError(f"an alignment {', '.join(ALIGNMENTS)} was expected, {alignment!r} found")
-    if not math.isfinite(tolerance_s) or tolerance_s < 0.0:
-        raise OmnidError(f"a tolerance of 0 s or more was expected, {tolerance_s} found: try 0.01")
+    if alignment not in ALIGNMENTS or not 0.0 <= tolerance_s < math.inf:
+        expected = f"an alignment {', '.join(ALIGNMENTS)} and a tolerance of 0 s or more"
+        raise OmnidError(f"{expected} were expected, {alignment!r} and {tolerance_s} found")
     of_estimate, of_truth = associate(estimate.stamps_ns, truth.stamps_ns, round(tolerance_s * 1e9))
     if of_estimate.size < 2:
         raise OmnidError(

@@ -42,12 +42,7 @@ Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord
 
 
 def choose_odometry_topic(log: Log, topic: str | None, robot: str | None) -> str:
-    """Return the topic of the poses.
-
-    1. A topic or a robot that the user names; it must hold nav_msgs/msg/Odometry.
-    2. Else the only topic with messages of that type.
-    3. Of several, the only one that has omnid's name `.../odom`.
-    4. Else the user must name one.
+    """Return the topic of the poses: one that is named, else the only one of its type, else the only `.../odom`.
 
     topic: the full name, such as /omnid/odom; robot: stands for /<robot>/odom. Raise OmnidError where there is no
     such topic, or several and none is named.
@@ -56,22 +51,17 @@ def choose_odometry_topic(log: Log, topic: str | None, robot: str | None) -> str
     known = [name for name, schema in sorted(log.topics.items()) if schema == ODOMETRY_SCHEMA and counts[name]]
     if topic is None and robot is not None:
         topic = f"/{robot.strip('/')}/{ODOMETRY}"
-    own = [name for name in known if name.endswith(f"/{ODOMETRY}")]
-    if topic in known:
-        return str(topic)
-    if topic is None and 1 in (len(known), len(own)):
-        return own[0] if len(own) == 1 else known[0]
     if topic is not None:
-        wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}: found {listed(known, 'none')}; name one of these topics"
-    elif known:
-        wrong = f"several topics with {ODOMETRY_SCHEMA}: {listed(known)}; choose one with --topic"
-    elif any(schema in IMAGE_TYPES for schema in log.topics.values()):
-        rig = "" if "rig.toml" in log.attachments() else " --rig rig.toml"
-        command = f"`omnid replay {log.path}{rig} --record out.mcap`"
-        wrong = f"images but no {ODOMETRY_SCHEMA}: run {command} and use out.mcap"
+        found = [topic] if topic in known else []
     else:
-        wrong = f"no {ODOMETRY_SCHEMA}: found {listed(log.topics, 'none')}; expected a recording of a run"
-    raise OmnidError(f"{log.path}: {wrong}")
+        found = known if len(known) == 1 else [name for name in known if name.endswith(f"/{ODOMETRY}")]
+    if len(found) == 1:
+        return found[0]
+    wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}" if topic else f"{len(known) or 'no'} topics of {ODOMETRY_SCHEMA}"
+    raise OmnidError(
+        f"{log.path}: {wrong}: found {listed(known or log.topics, 'none')}; name one by --topic, or make a recording "
+        "by `omnid replay LOG --record out.mcap`"
+    )
 
 
 class RecordedMessage(NamedTuple):

@@ -181,7 +181,7 @@ def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert "no route is being taught" in refusal(RouteRequest(RouteAction.FINISH))
     robot.stage.process(WheelState(False, True, "a stop was asked for"))
     assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))
-    assert "no route nowhere in" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
+    assert "cannot read the route" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
     assert len(robot.updates[-1].answers) == 9
 
 
