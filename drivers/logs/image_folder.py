@@ -17,6 +17,7 @@ import os
 import re
 from collections.abc import Sequence
 from decimal import Decimal
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -37,14 +38,8 @@ _MAX_VISITED: Final = 10_000
 
 def image_folders(path: Path) -> list[Path]:
     """Return the folders with images below a folder, among the first 10,000 folders that are visited."""
-    found: list[Path] = []
-    for visited, (folder, inner, files) in enumerate(os.walk(path)):
-        inner.sort()
-        if Path(folder) != path and any(map(_is_image, files)):
-            found.append(Path(folder))
-        if visited >= _MAX_VISITED:
-            break
-    return found
+    visited = sorted(islice(os.walk(path), _MAX_VISITED))
+    return [Path(folder) for folder, _, files in visited if Path(folder) != path and any(map(_is_image, files))]
 
 
 def _is_image(name: str) -> bool:

@@ -11,9 +11,8 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import zstandard
@@ -116,12 +115,7 @@ class LoggedMessage:
         return parse_motion(self.kind, unpack_message(memoryview(self.logged)), aligned=self.aligned, joints=joints)
 
 
-class LogState(Enum):
-    """State of a log; the values are shown to the user."""
-
-    WHOLE = "whole"
-    WRITTEN = "being written"
-    BROKEN = "cut or corrupt"
+LogState: TypeAlias = Literal["whole", "being written", "cut or corrupt"]
 
 
 class Log:
@@ -198,8 +192,8 @@ class Log:
     def state(self) -> LogState:
         """The state; of a folder of images, and of a database, what is broken within shows when it is read."""
         if self._is_written:
-            return LogState.WRITTEN
-        return LogState.BROKEN if self.cut or self.faults else LogState.WHOLE
+            return "being written"
+        return "cut or corrupt" if self.cut or self.faults else "whole"
 
     @property
     def faults(self) -> list[str]:

@@ -22,10 +22,9 @@ from drivers.logs.sqlite_bag import SqliteBag
 
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 # A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format. Until it is
-# complete, a recording of omnid ends with .part, and one of rosbag with .active.
+# complete, a recording of omnid ends with .part.
 _NAME: Final = re.compile(
-    r"(?P<log>(?P<name>.+?)(?P<time>_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?"
-    r"(?P<format>\.(?:mcap|db3|bag)))(?:\.part|\.active)?"
+    r"(?P<name>.+?)(?:_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?(?P<format>\.(?:mcap|db3|bag))(?:\.part)?"
 )
 _LISTED_FILES: Final = re.compile(r"^ *- ['\"]?(?:.*/)?(\S+?\.(?:mcap|db3))(?:\.zstd)?['\"]?$", re.M)  # of rosbag2
 _FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
@@ -106,22 +105,18 @@ def logs_in(folder: Path) -> list[Path]:
 def parts_in_order(logs: list[Path]) -> tuple[list[Path], list[str]]:
     """Return the parts of a log in the order of their numbers, none where the files are not such parts, and its gaps.
 
-    Parts have one name and numbers: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them. Where their names have
-    times, these rise with the numbers: else the files are of several recordings, as where more numbers lack than are
-    there. A single log is its only part.
+    Parts have one name and numbers: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them. A single log is its
+    only part; where more numbers lack than are there, the files are of several recordings.
     """
     matches = [(log, match) for log in logs if (match := _NAME.fullmatch(log.name))]
-    found = {int(match["part"] or 0): (log, match) for log, match in matches}
-    numbers = sorted(found)
-    times = [found[number][1]["time"] or "" for number in numbers]
-    names = {(match["name"], match["format"], bool(match["part"]) or len(logs) == 1) for _, match in matches}
-    if len(found) != len(logs) or times != sorted(times) or len(names) != 1:
+    found = {int(match["part"] or -1): log for log, match in matches}
+    names, numbers = {(match["name"], match["format"]) for _, match in matches}, sorted(found)
+    is_one = len(found) == len(logs) and len(names) == 1 and (len(logs) == 1 or numbers[0] >= 0)
+    if not is_one or numbers[-1] - numbers[0] >= 2 * len(numbers):
         return [], []
-    ((name, suffix, is_numbered),) = names
-    if not is_numbered or numbers[-1] - numbers[0] >= 2 * len(numbers):
-        return [], []
+    ((name, suffix),) = names
     gaps = [f"{name}_{number}{suffix}" for number in range(numbers[0], numbers[-1]) if number not in found]
-    return [found[number][0] for number in numbers], gaps
+    return [found[number] for number in numbers], gaps
 
 
 def _unlisted(folder: Path, logs: list[Path]) -> list[str]:

@@ -34,7 +34,6 @@ class RotationSettings:
 
     file_bytes: int = 500 * _MB  # size at which a new file is started
     file_s: float = 600.0  # age at which a new file is started, by the stamps
-    keep_files: int = 1000  # the oldest are deleted
     keep_bytes: int = 20_000 * _MB  # of all files, including the one being written at its full size
     free_bytes: int = 1000 * _MB  # reserved on the disk: with less free space nothing is recorded
     sync_s: float = 3.0  # period of writing to the disk (fsync)
@@ -49,11 +48,9 @@ class RotatingLogState:
     file: str = ""  # being written
     problem: str = ""  # reason for the status "stopped"
     messages: int = 0  # received
-    lost: int = 0  # of these, in no file, since the disk failed or was full
-    refused: int = 0  # of these, invalid: of an unknown type, or without a valid stamp
+    lost: int = 0  # of these, in no file: the disk failed or was full, or they are not valid
     files: int = 0  # created
     deleted: int = 0  # oldest files
-    stops: int = 0  # transitions to the status "stopped"
 
 
 class RotatingLog:
@@ -82,54 +79,48 @@ class RotatingLog:
         """Write a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
         self.state.messages += 1
         if not 0 <= stamp_ns < LATEST_NS:
-            self._refuse(f"{topic!r}: its stamp {stamp_ns} ns is not a time")
+            self.state.lost += 1
             return
-        # 1. The file.
         keep, age_s = self._rotation, abs(stamp_ns - self._start_ns) / 1e9
         if self._writer is not None and (self._writer.size_bytes >= keep.file_bytes or age_s >= keep.file_s):
             self.end_file()
-        if self._writer is None and time.monotonic() >= self._retry_at_s:
-            try:
-                self._begin_file(stamp_ns)
-            except DriverError as error:
-                self._stop(error)
-        writer = self._writer
-        if writer is None:
-            self.state.lost += 1
-            return
-        # 2. The message.
+        is_written = False
         try:
-            writer.write(topic, schema_name, data, stamp_ns)
-        except DriverError as error:
-            if writer.usable:
-                self._refuse(str(error))
-            else:
-                self._stop(error)
-            return
-        if self.state.status == "stopped" and writer.persisted:
-            self.state.status, self.state.problem = "recording", ""
-            lost = self.state.lost - self._lost_before
-            self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
-        # 3. The disk.
-        if time.monotonic() - self._synced_s >= keep.sync_s:
-            self._synced_s = time.monotonic()
-            try:
-                writer.sync()
+            # 1. The file, and the message.
+            if self._writer is None and time.monotonic() >= self._retry_at_s:
+                self._begin_file(stamp_ns)
+            if self._writer is None:
+                self.state.lost += 1
+                return
+            self._writer.write(topic, schema_name, data, stamp_ns)
+            is_written = True
+            if self.state.status == "stopped" and self._writer.persisted:
+                self.state.status, self.state.problem = "recording", ""
+                lost = self.state.lost - self._lost_before
+                self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
+            # 2. The disk.
+            if time.monotonic() - self._synced_s >= keep.sync_s:
+                self._synced_s = time.monotonic()
+                self._writer.sync()
                 self._require_free_space(keep.free_bytes)
-            except DriverError as error:
-                if writer.usable:
-                    self.end_file()
+        except DriverError as error:
+            if self._writer is None or not self._writer.usable:
+                self.state.lost += self._writer is None
                 self._stop(error)
+            elif is_written:
+                self.end_file()
+                self._stop(error)
+            else:  # the message is not valid
+                self.state.lost += 1
 
     def end_file(self) -> None:
         """Complete the file, if there is one, and rename it: the next message begins another one."""
-        if self._writer is None:
-            return
-        try:
-            self._writer.close()
-            self._path.rename(self._path.with_suffix(""))
-        except (DriverError, OSError) as error:
-            self._stop(error)
+        if self._writer is not None:
+            try:
+                self._writer.close()
+                self._path.rename(self._path.with_suffix(""))
+            except (DriverError, OSError) as error:
+                self._stop(error)
         self._writer, self.state.file = None, ""
 
     def close(self) -> None:
@@ -150,68 +141,52 @@ class RotatingLog:
         try:
             self._writer = LogWriter(self._path, self._attachments, compression="none", exclusive=True)
         except DriverError as error:
-            if not isinstance(error.__cause__, FileExistsError):
-                with suppress(OSError):
-                    self._path.unlink()
+            if not isinstance(error.__cause__, FileExistsError):  # of another program
+                self._path.unlink(missing_ok=True)
             raise
         self._start_ns, self._synced_s = stamp_ns, time.monotonic()
         self.state.files, self.state.file = self.state.files + 1, str(self._path)
         if self.state.status == "waiting":
             self.state.status = "recording"
 
-    def _refuse(self, reason: str) -> None:
-        self.state.refused += 1
-        if self.state.refused == 1:
-            self._on_event(logging.WARNING, f"recording: refused a message; further ones are counted: {reason}")
-
     def _stop(self, error: Exception) -> None:
         """Close the file; its data on the disk is kept."""
         if self.state.status != "stopped":
             self.state.status, self._lost_before = "stopped", self.state.lost
-            self.state.stops += 1
             self._on_event(logging.WARNING, f"recording: stopped, and tried again until it works: {error}")
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            self.state.lost += writer.messages - writer.persisted
+        if self._writer is not None:
+            self.state.lost += self._writer.messages - self._writer.persisted
             with suppress(DriverError):  # which has been reported
-                writer.close()
-            if not writer.persisted:
+                self._writer.close()
+            if not self._writer.persisted:
                 with suppress(OSError):
                     self._path.unlink()
-        self.state.problem, self.state.file = str(error), ""
+        self._writer, self.state.problem, self.state.file = None, str(error), ""
         self._retry_at_s = time.monotonic() + self._rotation.retry_s
 
     def _delete_oldest(self) -> None:
-        """Delete the oldest recordings of this name until there is room for one more within the limits.
+        """Delete the oldest recordings of this name until there is room for one more within the limit.
 
         Those of this run are the newest, in their order: the clock may have been set back meanwhile. Files that are
         being written, or cannot be deleted, are kept, and links are none.
         """
-        # 1. Place in this run, name, path and size of each file, which sort by age.
         pattern = re.compile(re.escape(self._name) + rf"_\d{{8}}T\d{{6}}Z_\d{{3,}}\.mcap(?:{re.escape(_PART)})?")
-        found: list[tuple[int, str, str, int]] = []
-        with suppress(OSError), os.scandir(self._folder) as entries:
-            for entry in entries:
-                if pattern.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
-                    with suppress(OSError):  # another program may have deleted it
-                        place = self._own.get(entry.name.removesuffix(_PART), 0)
-                        found.append((place, entry.name, entry.path, entry.stat().st_size))
-        # 2. From the oldest on.
-        count, total_bytes, keep = len(found), sum(size for *_, size in found), self._rotation
-        for *_, path, size in sorted(found):
-            if count < keep.keep_files and total_bytes <= keep.keep_bytes - keep.file_bytes:
-                break
-            with suppress(OSError):
+        with suppress(OSError):
+            names = [name for name in os.listdir(self._folder) if pattern.fullmatch(name)]
+            files = [self._folder / name for name in names if not os.path.islink(self._folder / name)]
+            sizes = {path: path.stat().st_size for path in files}
+            for path in sorted(files, key=lambda path: (self._own.get(path.name.removesuffix(_PART), 0), path.name)):
+                if sum(sizes.values()) <= self._rotation.keep_bytes - self._rotation.file_bytes:
+                    break
                 if not is_locked(path):
-                    os.unlink(path)
-                    count, total_bytes = count - 1, total_bytes - size
+                    path.unlink()
+                    del sizes[path]
                     self.state.deleted += 1
 
     def _require_free_space(self, wanted_bytes: int) -> None:
         """Create the folder; raise DriverError where it cannot be created, or the disk has less free space."""
         try:
-            with suppress(FileExistsError):
-                self._folder.mkdir()
+            self._folder.mkdir(exist_ok=True)
             disk = os.statvfs(self._folder)
         except OSError as error:
             raise DriverError(

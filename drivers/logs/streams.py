@@ -1,8 +1,8 @@
 """Which topics of a log are the cameras, the wheels and the IMU, and by which of its two times a message is stamped.
 
 A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. The header is
-the better one, and is used unless it is not set. Headers that do not advance, run back, or count by another clock than
-that of the other camera are refused: `log.time` says which time is used. In a file the images of a camera are in the
+the better one, and is used unless it is not set. Headers that do not advance or run back are refused: `log.time` says
+which time is used. In a file the images of a camera are in the
 order of their headers, but for late ones, which fill a hole between others. Where a clock was set back, images lie
 beside others instead, or far behind.
 """
@@ -126,42 +126,40 @@ class StampRule(NamedTuple):
 def stamp_rule(images: Mapping[Camera, LoggedImages], source: TimeSource = "auto") -> StampRule:
     """Return how the messages of a log are stamped, by the images of both cameras.
 
-    Raise DriverError, by "auto", where the headers cannot be the times at which both cameras took their images.
+    Raise DriverError, by "auto", where the headers cannot be the times at which a camera took its images.
     """
     # 1. Headers that are not set.
-    both, is_auto = [images[camera] for camera in CAMERAS], source == "auto"
+    both, is_auto, warnings = [images[camera] for camera in CAMERAS], source == "auto", list[str]()
     unset = [int(np.count_nonzero((each.header_ns == 0) & (each.log_ns != 0))) for each in both]
     is_unset = any(count > max(1, _FEW * len(each.header_ns)) for count, each in zip(unset, both, strict=True))
     by_header = source == "header" or (is_auto and not is_unset)
+    used = sum(unset) if by_header else is_auto * sum(len(each.log_ns) for each in both)
+    if used:
+        warnings.append(f"used the times of logging for {used} images: the stamps of their headers are 0")
     # 2. Times that are wrong.
-    apart_ns = abs(_delay_ns(both[0]) - _delay_ns(both[1])) if by_header and all(map(_is_live, both)) else 0
-    if is_auto:
-        faults = [_fault(each.header_ns if by_header else each.log_ns, each.log_ns) for each in both]
-        fault = next(filter(None, faults), "")
-        if apart_ns > _STEP_NS and not fault:
-            fault = f"are {apart_ns * 1e-9:.3f} s apart between the cameras"
-        if fault:
-            times = (
-                "stamps of its images' headers" if by_header else "headers of its images are 0, the times of logging"
-            )
-            raise DriverError(
-                f"the {times} {fault}: expected those of one clock that runs on; cut the log there, or choose "
-                'log.time = "log", the times of logging, or "header"'
-            )
+    faults = [_fault(each.header_ns if by_header else each.log_ns, each.log_ns) for each in both if is_auto]
+    if fault := next(filter(None, faults), ""):
+        times = "stamps of its images' headers" if by_header else "headers of its images are 0, the times of logging"
+        raise DriverError(
+            f"the {times} {fault}: expected those of one clock that runs on; cut the log there, or choose "
+            'log.time = "log", the times of logging, or "header"'
+        )
     if not by_header:
-        return StampRule(False, 0, _unset_warning(sum(len(each.log_ns) for each in both) * is_auto))
-    # 3. Cameras whose clocks differ by less.
-    warnings = _unset_warning(sum(unset))
-    if apart_ns and 2 * apart_ns >= min(_step_ns(each.header_ns) for each in both):
-        warnings.append(
+        return StampRule(False, 0, warnings)
+    # 3. Cameras whose clocks differ.
+    delays_ns, steps_ns = [_delay_ns(each) for each in both], [list(map(_step_ns, each)) for each in both]
+    apart_ns = abs(delays_ns[0] - delays_ns[1])
+    # Images are logged at about the rate of their headers, unlike by a conversion.
+    is_live = all(_FASTEST * min(steps) > max(steps) for steps in steps_ns)
+    if is_live and 2 * apart_ns >= min(header_step_ns for header_step_ns, _ in steps_ns):
+        line = (
             f"the clocks of the cameras differ by {apart_ns * 1e-9:.3f} s, half a period or more: images of different "
             'moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
         )
-    return StampRule(True, _delay_ns(both[0]), warnings)
-
-
-def _unset_warning(count: int) -> list[str]:
-    return [f"used the times of logging for {count} images: the stamps of their headers are 0"] if count else []
+        if is_auto and apart_ns > _STEP_NS:
+            raise DriverError(line)
+        warnings.append(line)
+    return StampRule(True, delays_ns[0], warnings)
 
 
 def _fault(times: Times, log_ns: Times) -> str:
@@ -187,12 +185,6 @@ def _fault(times: Times, log_ns: Times) -> str:
     is_late = np.append(False, times[1:] <= np.maximum.accumulate(times)[:-1])
     wrong = np.flatnonzero((is_late & is_crowded[place]) | (behind_ns > _STEP_NS)).tolist()
     return f"run back by {behind_ns[wrong[0]] * 1e-9:.3f} s at image {wrong[0] + 1}" if wrong else ""
-
-
-def _is_live(images: LoggedImages) -> bool:
-    """True if images were logged at about the rate of their headers, unlike by a conversion."""
-    header_ns, log_ns = map(_step_ns, images)
-    return header_ns < _FASTEST * log_ns and log_ns < _FASTEST * header_ns
 
 
 def _delay_ns(images: LoggedImages) -> int:

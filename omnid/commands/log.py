@@ -10,7 +10,7 @@ from dataclasses import asdict
 import numpy as np
 
 from drivers.errors import DriverError
-from drivers.logs.log import Log, LogState
+from drivers.logs.log import Log
 from drivers.logs.open_log import open_log
 from omnid.commands.options import JSON, RATE, command, failed, print_entries, print_json, warn
 from omnid.formats.tum import Trajectory, read_tum
@@ -19,6 +19,7 @@ from omnid.recordings.evaluation import evaluate
 from omnid.recordings.truth_frame import find_truth_frame
 from omnid.utc import utc
 
+BROKEN = "cut or corrupt"
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
@@ -45,7 +46,7 @@ def info(args: argparse.Namespace) -> int:
         print("\n" * bool(number), end="")
         with closing(log):
             _show(log)
-        code = max(code, int(log.state is LogState.BROKEN))
+        code = max(code, int(log.state == BROKEN))
     return code
 
 
@@ -54,7 +55,7 @@ def _show(log: Log) -> None:
     counts = Counter(message.topic for message in log.messages())  # what cannot be read shows by that
     faults = [log.cut] if log.cut else []
     faults += [f"{len(log.faults)} corrupt chunks or records, which are skipped"] if log.faults else []
-    state = f"{log.state.value}: {'; '.join(faults)}" if log.state is LogState.BROKEN else log.state.value
+    state = f"{log.state}: {'; '.join(faults)}" if log.state == BROKEN else log.state
     logged_ns, time = log.entries["time_ns"], ""
     if logged_ns.size:
         first_ns, last_ns = int(logged_ns.min()), int(logged_ns.max())

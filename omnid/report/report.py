@@ -63,7 +63,7 @@ def _head(run: RecordedRun) -> list[str]:
     """Return the title, the key figures, and warnings."""
     count, end_s = len(run.t_s), run.end_s
     source = (
-        f"{run.path}, {run.log.size_bytes / 1e6:.1f} MB, {run.log.state.value}. Poses of {run.frames[1]} in "
+        f"{run.path}, {run.log.size_bytes / 1e6:.1f} MB, {run.log.state}. Poses of {run.frames[1]} in "
         f"{run.frames[0]} on {run.topic}, from {utc(run.start_ns)}."
     )
     rate = f", {(count - 1) / end_s:.1f}/s" if end_s > 0 else ""

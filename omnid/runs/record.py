@@ -68,8 +68,8 @@ def progress_line(recorder: Recorder, graph: Graph) -> str:
     """Return one line with the counts of the recording."""
     state = recorder.state
     dropped = sum(stage.dropped for stage in graph.telemetry.stages if stage.name == "record")
-    written = state.messages - state.lost - state.refused
+    written = state.messages - state.lost
     return (
         f"recording: {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
-        f"refused {state.refused + recorder.invalid}, oldest files deleted {state.deleted}, {state.status}"
+        f"refused {recorder.invalid}, oldest files deleted {state.deleted}, {state.status}"
     )

@@ -337,7 +337,7 @@ AS_TAKEN: Final = [
 WRONG: Final[dict[str, tuple[Times, str]]] = {
     "whole seconds": (lambda topic, number, ns: ns // S * S, "do not advance"),
     "microseconds for nanoseconds": (lambda topic, number, ns: ns // 1000, "headers are 100 us apart"),
-    "two clocks": (lambda topic, number, ns: ns - 7 * S * (topic == LOWER), "7.000 s apart between the cameras"),
+    "two clocks": (lambda topic, number, ns: ns - 7 * S * (topic == LOWER), "clocks of the cameras differ by 7.000 s"),
     "one of the future": (lambda topic, number, ns: ns + 3600 * S * (number == HALF), "run back by 3599.9"),
     "a clock set back within a period": (back(0.13), "run back by 0.030 s at image 21"),
     "a clock set back by more than the log": (back(3600), "run back by 3599.9"),

@@ -105,7 +105,7 @@ def test_starts_a_new_file_by_size_and_by_age(bench: Callable[..., Bench], rotat
 
 
 def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> None:
-    recording = bench(replace(ROOMY, file_s=1.0, keep_files=3))
+    recording = bench(replace(ROOMY, file_s=1.0, file_bytes=100_000, keep_bytes=180_000))
     strangers = ["notes.txt", "robot_20200101T000000Z_001.mcap.bak", "other_20200101T000000Z_001.mcap"]
     recording.folder.mkdir()
     for name in strangers:
@@ -121,13 +121,13 @@ def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> Non
 
 
 def test_a_file_that_another_program_writes_is_not_deleted(bench: Callable[..., Bench]) -> None:
-    recording = bench(replace(ROOMY, file_s=1.0, keep_files=2))
+    recording = bench(replace(ROOMY, file_s=1.0, file_bytes=100_000, keep_bytes=140_000))
     recording.folder.mkdir()
     written = recording.folder / "robot_20200101T000000Z_001.mcap.part"
     with written.open("wb") as file:
         fcntl.flock(file.fileno(), fcntl.LOCK_EX)
         recording.write(200)
-    assert written.exists() and recording.state.deleted == recording.state.files - 1 > 3
+    assert written.exists() and recording.state.deleted == recording.state.files - 2 > 3
 
 
 @pytest.fixture
@@ -182,7 +182,7 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     assert recording.events[1][1].endswith(f"; {recording.state.lost} messages were lost")
     whole = sum(counted(path) for path in recording.folder.glob("*.mcap"))
     saved = len(list(open_log(recording.folder / recording.names()[0]).messages()))
-    assert saved >= 25 and whole >= 50 and recording.state.stops == 1
+    assert saved >= 25 and whole >= 50
     assert recording.state.messages == saved + whole + recording.state.lost
 
 

@@ -148,7 +148,9 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
     computer.advance(5.0)
     of_run = computer.clock()
     encode = Encoder(np.eye(4), 0, of_run.segment_unix_ns)
-    monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(keep_files=2, free_bytes=0))
+    monkeypatch.setattr(
+        RecordConfig, "rotation", lambda _: RotationSettings(file_bytes=10**6, keep_bytes=10**6 + 65_000, free_bytes=0)
+    )
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, encode=encode, clock=of_run)
     for n in range(30):
