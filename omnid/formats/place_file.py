@@ -62,7 +62,7 @@ def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
     arrays = _to_arrays(places, rig)
     with replaced(Path(path), "map") as partial, partial.open("wb") as file:
         _check(arrays)
-        np.savez(file, **arrays)
+        np.savez(file, **dict[str, Any](arrays))
 
 
 def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMap, PlaceRig]:

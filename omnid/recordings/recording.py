@@ -60,7 +60,7 @@ def choose_odometry_topic(log: Log, topic: str | None, robot: str | None) -> str
     wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}" if topic else f"{len(known) or 'no'} topics of {ODOMETRY_SCHEMA}"
     raise OmnidError(
         f"{log.path}: {wrong}: found {listed(known or log.topics, 'none')}; name one by --topic, or make a recording "
-        "by `omnid replay LOG --record out.mcap`"
+        f"by `omnid replay {log.path} --record out.mcap`"
     )
 
 
