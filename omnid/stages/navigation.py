@@ -29,7 +29,7 @@ from omnid.core.navigation.requests import (
     may_begin_motion,
     stops_motion,
 )
-from omnid.core.navigation.route import KeyframePose, RouteRecorder, repeated_paths
+from omnid.core.navigation.route import ENTRY_M, KeyframePose, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_of_map, refusal_to_drive
 from omnid.core.navigation.surroundings import Surroundings, near_ends
@@ -52,7 +52,6 @@ NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | Wheel
 REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
 SCAN_NS = 2_000_000_000  # older scans show nothing of now: the collision monitor then stops the base
 OVERTAKEN = "a later request has ended it: ask again"
-FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 
 
 class NavigationStage:
@@ -231,9 +230,9 @@ class NavigationStage:
         pose = self._pose_in(path.frame)
         away_m = math.dist(pose[:2], path.xy[0])
         self._require_near(away_m)
-        if away_m > FIRST_LEG_M:
+        if away_m > ENTRY_M:
             raise OmnidError(
-                f"the path begins {away_m:.1f} m away from the robot, expected at most {FIRST_LEG_M:g} m: "
+                f"the path begins {away_m:.1f} m away from the robot, expected at most {ENTRY_M:g} m: "
                 "drive to its start (`omnid goto`), or let it begin here"
             )
         return drive_path(np.vstack([pose[None, :2], path.xy]), path.heading_rad)

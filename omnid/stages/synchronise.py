@@ -26,7 +26,6 @@ RECENT: Final = 30  # pairs, and steps between the stamps of a camera, by which 
 STAMP_SIGMA_NS: Final = 1_500_000  # scatter of the stamps of cameras that are triggered together, before it is known
 FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
 MAX_WAITING: Final = 4  # frames of a camera that wait: the other camera may be delivered a few periods later
-MOST_APART_NS: Final = NS_PER_S // 10  # Largest difference of a pair, because a pause at the start is no period.
 MOST_WAITING: Final = 4096  # samples of wheels and gyro: ten seconds of a gyro of 400 Hz
 AHEAD_NS: Final = 5 * NS_PER_S  # a sample that is later than a pair by more has a stamp of another clock
 
@@ -271,7 +270,7 @@ class Synchronise:
     def _tolerance_ns(self) -> float:
         periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.steps_ns]
         # Before the period is known, only what the scatter of the stamps explains.
-        return self._fixed_ns or min(min(periods_ns, default=8 * STAMP_SIGMA_NS) / 2, MOST_APART_NS)
+        return self._fixed_ns or min(periods_ns, default=8 * STAMP_SIGMA_NS) / 2
 
     def _joined(self, frames: tuple[Frame, Frame], images: tuple[Image, Image]) -> FramePair | None:
         # 1. Frames that waited before these can match no later one: they are given up.

@@ -28,8 +28,6 @@ FILLED_SECTORS: Final = 4
 # The ranges on both sides of a gap belong to one surface if their ratio is at most this; by trial on development seeds.
 SURFACE_RATIO: Final = 1.15
 
-# Sigmas above the floor from which a point is an obstacle: 2 % of the points of the floor are.
-HEIGHT_SIGMAS: Final = 2.0
 INVERSE_STEP: Final = 0.02  # width of a bin [1/m]: two of them are about four sigma of a usual rig
 NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base.
 
@@ -97,11 +95,12 @@ def point_scan(
     the floor; tilt_rad: sigma of the base's tilt against it; min_points: least number of points of an obstacle;
     floor_sigma_m: of the height of the floor.
     """
-    # 1. The points within the band of heights, by a margin for the noise of stereo and the tilt of the base.
+    # 1. The points within the band of heights, by a margin of two sigma for the noise of stereo and the tilt of the
+    #    base: 2 % of the points of the floor are beyond it.
     low, high = heights_m
     across2, rise2 = ((points[:, :2] - view[:2]) ** 2).sum(axis=1), (points[:, 2] - view[2]) ** 2
     of_stereo2 = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
-    margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + tilt_rad**2 * across2 + floor_sigma_m**2)
+    margin = 2 * np.sqrt(of_stereo2 + tilt_rad**2 * across2 + floor_sigma_m**2)
     x, y, z = points.T
     ranges = np.hypot(x, y)
     chosen = (ranges > NEAREST_M) & np.isfinite(sigma_m) & (z - margin > low) & (z + margin < high)

@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _AXIS_BITS = 21  # Bits of a packed key per axis, so that three of them fit the 63 bits of a positive key.
-_LOAD_AFTER_EVICTION = 0.7  # Share of the voxels that an eviction leaves, so that evictions are rare.
 # A voxel seen once and not again for this number of frames is most likely a false match; by trial on development seeds.
 # A count and no time, as the age of a point, because each frame is another look.
 _OLD_FRAMES = 30
 # A voxel: its sums are those of information (1 / variance), and of information times x, y, z.
 VOXEL = np.dtype([("key", np.int64), ("sums", float, 4), ("frames", np.int32), ("last_seq", np.int64)])
-_VARIANCE_RANGE_M2 = (1e-8, 1e8)  # standard deviations of 0.1 mm to 10 km, so that sums of weights cannot overflow
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +55,7 @@ class VoxelMap:
         usable = (np.abs(points) < half_span * self._voxel_m).all(axis=1)  # False for NaN and infinity
         usable &= np.isfinite(variance_m2) & (variance_m2 > 0.0)
         self._newest_seq = max(self._newest_seq, seq)
-        points, weight = points[usable], 1.0 / np.clip(variance_m2[usable], *_VARIANCE_RANGE_M2)
+        points, weight = points[usable], 1.0 / variance_m2[usable]
         index = np.floor(points / self._voxel_m).astype(np.int64) + half_span
         x, y, z = np.clip(index, 0, 2 * half_span - 1).T  # rounding at the border
         keys, voxel = np.unique((x << (2 * _AXIS_BITS)) | (y << _AXIS_BITS) | z, return_inverse=True)
@@ -95,10 +93,10 @@ class VoxelMap:
         return np.asarray(frames / (frames + 1.0) * weight / (weight + self._voxel_m**-2))
 
     def _evict(self) -> None:
-        """Drop voxels down to _LOAD_AFTER_EVICTION: those seen once and long ago first, then the least confident."""
+        """Drop half of the voxels: those seen once and long ago first, then the least confident."""
         age = self._newest_seq - self._voxels["last_seq"]
         is_old = (self._voxels["frames"] == 1) & (age > _OLD_FRAMES)
         # The sort is stable, so the key decides about ties.
         order = np.lexsort((self._confidence(), ~is_old))
-        dropped = len(order) - int(_LOAD_AFTER_EVICTION * self._most)
+        dropped = len(order) - self._most // 2
         self._voxels = self._voxels[np.sort(order[dropped:])]

@@ -35,9 +35,6 @@ LARGEST: Final = 0.2  # Limit of a histogram's entries, of one of length 1 (Lowe
 SCALE: Final = 512.0  # Factor on the square roots of a descriptor's shares, so that they fill a byte.
 
 ROWS, COLUMNS = 16, 128  # of a thumbnail: 2 kB a keyframe, 2.8 degrees a column; by trial on development seeds
-# Columns, rows: window of the mean that is subtracted, because brightness changes with the light.
-SMOOTH: Final = (31, 5)
-THUMBNAIL_SCALE: Final = 30.0  # Root mean square of a thumbnail's values, so that hardly any exceeds a byte.
 
 
 def describe(frame: StereoFrame) -> PlaceFeatures:
@@ -126,16 +123,19 @@ def _cell_weights() -> Floats:
 def thumbnail(panorama: PaddedPanorama) -> Thumbnail:
     """Return the panorama (H, W) at (ROWS, COLUMNS) of a full turn without its slow changes of brightness.
 
-    The root mean square is THUMBNAIL_SCALE; zeros outside of a sector.
+    The root mean square is a quarter of the largest byte, so that hardly any is more; zeros outside of a sector.
     """
+    # 1. The difference to the mean in a window, because brightness changes with the light.
+    smooth, largest = (COLUMNS // 4 - 1, ROWS // 3), np.iinfo(np.int8).max
     columns = max(1, round(COLUMNS * panorama.width / panorama.period_px))
     small = cv2.resize(panorama.panorama, (columns, ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
-    pad = SMOOTH[0] // 2
+    pad = smooth[0] // 2
     border = cv2.BORDER_WRAP if columns == COLUMNS else cv2.BORDER_REPLICATE
-    contrast = small - cv2.blur(cv2.copyMakeBorder(small, 0, 0, pad, pad, border), SMOOTH)[:, pad:-pad]
+    contrast = small - cv2.blur(cv2.copyMakeBorder(small, 0, 0, pad, pad, border), smooth)[:, pad:-pad]
+    # 2. Its place in a full turn.
     whole, first = np.zeros((ROWS, COLUMNS), np.float32), round(COLUMNS * panorama.first / panorama.period_px)
     whole[:, (first + np.arange(columns)) % COLUMNS] = contrast / max(float(np.linalg.norm(contrast)), 1.0)
-    return np.asarray(np.clip(np.rint(THUMBNAIL_SCALE * math.sqrt(whole.size) * whole), -127, 127), np.int8)
+    return np.asarray(np.clip(np.rint(largest / 4 * math.sqrt(whole.size) * whole), -largest, largest), np.int8)
 
 
 def signature_of(small: Thumbnail) -> Signature:

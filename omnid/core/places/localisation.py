@@ -34,6 +34,7 @@ from omnid.core.places.recognition import (
     GATE_M,
     GATE_RAD,
     MIN_MATCHES,
+    NEAR_M,
     Expected,
     PlaceSearch,
     Recognition,
@@ -45,7 +46,6 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometry itself still sees what is that near.
 TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is bounded
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
@@ -291,7 +291,7 @@ class MapLocaliser:
         # 1. Since odometry has left a keyframe of this run.
         ids = [id for id in sorted(self._current) if self._is_place(id)]
         drift_m = self._path_m - np.array([self._path_at.get(id, -math.inf) for id in ids])
-        left = drift_m >= LOCAL_M
+        left = drift_m >= 2 * NEAR_M  # odometry itself still sees what is nearer along the path
         ids, drift_m = [ids[n] for n in np.flatnonzero(left).tolist()], drift_m[left]
         # 2. Since the map last said where odom is, and from there to the keyframe.
         if self._recognised_at is not None:

@@ -19,8 +19,6 @@ Array = NDArray[np.float64]
 
 NO_KEYFRAME: Final = -1  # Used in place of an id, because ids are never negative.
 DESCRIPTOR: Final = 128  # Bytes of a descriptor; exact: 8 directions in 4 x 4 cells.
-# Most loops that a dropped keyframe leaves to its neighbour, the most certain ones.
-MOST_LOOPS: Final = 4
 # A map is of the same rig where baseline, shift [m] and turn [rad] of the rectified frame differ by less than this: the
 # rig may have been calibrated again.
 BASELINE_RATIO, SHIFT_M, TURN_RAD = 0.01, 0.01, 0.02
@@ -184,13 +182,13 @@ class PlaceMap:
         self.links = [link for link in self.links if id not in (link.a, link.b)]
         leaving = [link if link.a == id else link.reversed() for link in touching]
         bridge = min((link for link in leaving if not link.is_loop), key=lambda link: link.b <= id, default=None)
-        # 2. Links of the other keyframes to the neighbour, of loops the most certain ones.
+        # 2. Links of the other keyframes to the neighbour, of loops the two that are most certain.
         if bridge is not None:
             joined = [link.reversed().then(bridge) for link in leaving if link is not bridge and link.b != bridge.b]
             loops = sorted((link for link in joined if link.is_loop), key=lambda link: float(np.trace(link.covariance)))
             self.links += [
                 link if link.a < link.b else link.reversed()
-                for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])
+                for link in (*(link for link in joined if not link.is_loop), *loops[:2])
             ]
         # 3. The keyframe leaves the map.
         del self.keyframes[id], self.poses[id]
