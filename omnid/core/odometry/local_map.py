@@ -84,13 +84,6 @@ class Tracks:
     visible: int  # landmarks that were searched: those predicted within the panorama, or a sample of them
     each_counts: float = 1.0  # landmarks within the panorama, for each that was searched
 
-    def without(self, landmarks: Indices) -> Tracks:
-        """Return the tracks of other landmarks than these (K,)."""
-        others = ~np.isin(self.landmarks, landmarks)
-        return replace(
-            self, landmarks=self.landmarks[others], pixels=self.pixels[others], predicted=self.predicted[others]
-        )
-
 
 class LocalMap:
     """Keyframes by seq, their landmarks, and the last panorama in which these were found: the only writer of them."""
@@ -242,10 +235,6 @@ class LocalMap:
         table.misses[rows] = 0
         if (table.misses >= self._max_misses).any():
             self._select(table.misses < self._max_misses)
-
-    def give_up(self, rows: Indices) -> None:
-        """Let landmarks (rows of the table) be removed at the next `update_tracked`, unless they are inliers in it."""
-        self.table.misses[rows] = self._max_misses
 
     def keep(self, ids: Indices) -> None:
         """Remove all landmarks but these."""

@@ -40,10 +40,6 @@ MOST_MISSED = math.ceil(DECIDING_COST / math.log(29))
 # Sigmas within which a predicted motion is to be expected, so that a single step decides at a million to one at most.
 REACH_SIGMAS = math.sqrt(2 * DECIDING_COST)
 DISPLACEMENT_ERROR = 0.02  # of a displacement as a share of it, to all sides: few millimetres of some decimetres
-# Two poses contradict each other if their shares of the landmarks in view differ by less than the chance of which are
-# in view, and fewer than half of the landmarks support both: then the depths of one half are wrong.
-EQUAL_SHARE, COMMON_SHARE = 2 / 3, 0.5
-
 LANDMARKS = 120  # whose patches are compared: the mean of so many correlations errs by less than 0.1
 # Side of a patch in samples and their distance, px: as wide as the tracker's window, and blurred by as much as a step
 # of the grid moves it.
@@ -73,20 +69,20 @@ class OtherMotion:
         sigma_m = DISPLACEMENT_ERROR * float(np.linalg.norm(off[:3]))
         return np.outer(off, off) + np.diag(np.repeat([sigma_m**2, 0.0], 3))
 
-    def choose(
-        self, candidates: list[PoseEstimate], T_predicted: Array, dt_s: float, sigma_mps: float
-    ) -> tuple[PoseEstimate, NDArray[np.intp]]:
-        """Return the candidate nearest to the prediction, and the landmarks (rows of the map) that contradict it.
+    def choose(self, candidates: list[PoseEstimate], T_predicted: Array, dt_s: float, sigma_mps: float) -> PoseEstimate:
+        """Return the candidate nearest to the prediction.
 
         The first candidate is the pose that was found first, the others are of peaks. sigma_mps: standard deviation of
         the predicted velocity.
         """
         if not self.is_open and len(candidates) == 1:
             self.velocity = np.zeros(3)
-            return candidates[0], np.zeros(0, np.intp)
-        # 1. Candidates that the images allow. The costs of poses by wrong and by right depths do not decide.
-        cheapest = min(candidates, key=lambda each: each.cost)
-        likely = [each for each in candidates if _cost(each, cheapest) < DECIDING_COST]
+            return candidates[0]
+        # 1. Candidates that the images allow.
+        best = min(candidates, key=lambda each: each.cost)
+        likely = [
+            each for each in candidates if (each.cost - best.cost) * min(each.in_view, best.in_view) < DECIDING_COST
+        ]
         chosen = min(likely, key=lambda each: each.distance_m(T_predicted))
         # 2. The candidate farthest from it is the other motion.
         if self.is_open and chosen.distance_m(T_predicted) > REACH_SIGMAS * sigma_mps * dt_s:
@@ -103,10 +99,8 @@ class OtherMotion:
             if self._missed >= MOST_MISSED:
                 self.is_open, self._displacement, self.velocity = False, np.zeros(6), np.zeros(3)
         # 3. Of estimates of the same pose the one with most inliers.
-        wrong = [each.landmarks for each in candidates if contradict(each, chosen)]
         same = [each for each in candidates if each.distance_m(chosen.T_odom_rect) <= SAME_M]
-        chosen = max(same, key=lambda each: each.inliers)
-        return chosen, np.setdiff1d(np.concatenate(wrong or [np.zeros(0, np.intp)]), chosen.landmarks)
+        return max(same, key=lambda each: each.inliers)
 
     def predict(self, dt_s: float) -> None:
         """Move the other motion on by its velocity, at a frame that does not show it."""
@@ -127,22 +121,6 @@ class OtherMotion:
         """Let the other motion be one that led to another pose in dt_s since both agreed."""
         self._displacement = np.zeros(6)
         self.add(T_published, T_other, dt_s)
-
-
-def _cost(each: PoseEstimate, cheapest: PoseEstimate) -> float:
-    """Return by how much the images of an estimate cost more than those of the cheapest one."""
-    in_view = min(each.in_view, cheapest.in_view)
-    return 0.0 if contradict(each, cheapest) else (each.cost - cheapest.cost) * in_view
-
-
-def contradict(a: PoseEstimate, b: PoseEstimate) -> bool:
-    """True if about as many landmarks support one pose as the other, and they are not the same landmarks."""
-    if a is b:
-        return False
-    shares = [len(each.landmarks) / max(1, each.in_view) for each in (a, b)]
-    common = len(np.intersect1d(a.landmarks, b.landmarks, assume_unique=True))
-    fewest = min(len(a.landmarks), len(b.landmarks))
-    return min(shares) >= EQUAL_SHARE * max(shares) and common <= COMMON_SHARE * fewest
 
 
 def displacements(

@@ -161,12 +161,11 @@ class VisualOdometry:
                 self._other.replace(now.T_odom_rect, found[0].T_odom_rect, now.since_fix_s)
             is_known = bool(plausible) and plausible[0].inliers >= self._limits.good_inliers
             return self._refuse(now, found, gap if is_known else None)
-        estimate, contradicting = self._other.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
+        estimate = self._other.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(now, estimate, is_reset=bool(np.linalg.norm(gap[3:]) > JUMP_RAD))
         exposure = self._exposure(frame, dt_s)
-        self._map.give_up(contradicting)
         self._requested = self._update_map(now, estimate, exposure)
         features, is_keyframe = Features(estimate.pixels, estimate.rejected), self._requested is not None
         exposure = exposure if is_keyframe else self._exposure(frame)

@@ -119,7 +119,7 @@ class PoseSearch:
         self, frame: StereoFrame, found: PoseEstimate, T_predicted: Array, exposure: Exposure, reach_m: float
     ) -> list[PoseEstimate]:
         """Return estimates of other motions within reach_m of the prediction: see motion_hypotheses.py."""
-        # 1. Displacements within reach from which the scene has the same appearance, and the poses to which they lead.
+        # Displacements within reach from which the scene has the same appearance, and the poses to which they lead.
         off_m = found.distance_m(T_predicted)
         peaks = displacements(self._map, self._model, frame.lower, found.T_odom_rect, reach_m + off_m)
         is_good = is_good_enough(found, self._limits, is_near=False)
@@ -128,13 +128,6 @@ class PoseSearch:
             for x, y in peaks
             if x or y or not is_good
         ]
-        # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong. The
-        #    same where the inliers show no motion of a vehicle: they may be on a person who walks along, and what is
-        #    nearer to the prediction is right.
-        if found.inlier_ratio < self._limits.good_inlier_ratio or off_m > reach_m:
-            tracks = self._map.track(frame.lower, found.T_odom_rect, self._tracked, turn=frame.seq)
-            coarse = self.coarse(frame, tracks.without(found.landmarks), found.T_odom_rect, exposure)
-            others.append(None if coarse is None else self.refine(frame, coarse, exposure))
         return [each for each in others if each is not None and each.distance_m(T_predicted) < max(reach_m, off_m)]
 
     def estimate(self, frame: StereoFrame, T_guess: Array, exposure: Exposure, *, is_near: bool) -> PoseEstimate | None:

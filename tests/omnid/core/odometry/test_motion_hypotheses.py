@@ -80,7 +80,7 @@ def test_the_other_motion_goes_on_until_steps_without_its_peak_decide() -> None:
     other = OtherMotion()
 
     def chosen(*candidates: PoseEstimate) -> float:
-        found, _ = other.choose(list(candidates), np.eye(4), PERIOD_S, 0.1)
+        found = other.choose(list(candidates), np.eye(4), PERIOD_S, 0.1)
         return float(found.T_odom_rect[0, 3])
 
     def sigma_m() -> float:
