@@ -7,10 +7,9 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterator
 from contextlib import closing
 from importlib.util import find_spec
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 from calib.atomic_file import write_file
@@ -137,26 +136,23 @@ def doctor(args: argparse.Namespace) -> int:
     examples:
       doctor --config /etc/omnid/omnid.toml
     """
-    found: list[checks.Finding] = []
-    for finding in examine(settings_of(args)):
+    config, found = settings_of(args), list[checks.Finding]()
+    camera, wanted = config.cameras, config.realtime
+    named: dict[str, V4l2Settings] = {name: camera.settings(name) for name in SIDES}
+    images_hz = min(camera.rate_hz or USUAL_HZ, config.record.images_hz or math.inf)
+    rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * images_hz
+    for finding in chain(
+        checks.cameras(named, capture_devices(ROOT), ROOT),
+        checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.scan.floor_m),
+        checks.motor(config.motor, ROOT),
+        checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory),
+        checks.disk(checks.STATE / config.record.folder, config.record, rate),
+        [checks.bus(config.bus)],
+    ):
         print(finding, flush=True)
         found.append(finding)
     print(checks.summary(found))
     return int(any(finding.level == "error" for finding in found))
-
-
-def examine(config: Config) -> Iterator[checks.Finding]:
-    """Return the findings of all checks, the quick ones first."""
-    camera, wanted = config.cameras, config.realtime
-    named = {name: camera.settings(name) for name in ("lower", "upper")}
-    yield from checks.cameras(named, capture_devices(ROOT), ROOT)
-    yield from checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.scan.floor_m)
-    yield from checks.motor(config.motor, ROOT)
-    yield from checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
-    images_hz = min(camera.rate_hz or USUAL_HZ, config.record.images_hz or math.inf)
-    rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * images_hz
-    yield from checks.disk(checks.STATE / config.record.folder, config.record, rate)
-    yield checks.bus(config.bus)
 
 
 SETTLE = 10  # images of a camera that are skipped: its exposure adapts in the first ones

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from io import DEFAULT_BUFFER_SIZE
 from typing import Final
 
-from omnid.client import Diagnostics, Driver, Robot
+from omnid.client import Diagnostics, Robot
 from omnid.core.control.heading_controller import VelocityLimits
 from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError
@@ -104,12 +104,23 @@ def teleoperate(bus: BusConfig) -> int:
         try:
             status = ""
             while not stick.quit:
+                # 1. The keys, and the newest status of the robot.
                 stick.press(read_keys(keys), pressed_s)
-                pressed_s = time.monotonic()
+                now_s = pressed_s = time.monotonic()
                 if (report := statuses.newest()) is not None:
                     disarmed = report.value(WHEELS, Key.DISARMED_BY)
                     status = f"press a: not armed, {disarmed}" if disarmed else "armed"
-                _act(driver, stick, status)
+                # 2. What they ask for. The status has the answer to arming: the next key may be a stop.
+                if stick.stop_asked:
+                    driver.stop()
+                elif stick.arm_asked:
+                    driver.send(ARM, header_cdr(time.time_ns()))
+                stick.stop_asked = stick.arm_asked = False
+                velocity_mps, yaw_rate_radps = stick.twist(now_s)
+                if stick.commands(now_s):
+                    driver.twist(velocity_mps, yaw_rate_radps)
+                share = f"{100 * stick.share:.0f} %"
+                HANDLER.show(f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s  {share}  {status}")
         finally:
             driver.twist(0.0, 0.0)
             HANDLER.show("")
@@ -147,17 +158,3 @@ def read_keys(keys: int) -> bytes:
                 raise OmnidError("the terminal was closed: the wheels stop")
             data += found
     return data
-
-
-def _act(driver: Driver, stick: Stick, status: str) -> None:
-    if stick.stop_asked:
-        driver.stop()
-    elif stick.arm_asked:
-        driver.send(ARM, header_cdr(time.time_ns()))  # the status has the answer: the next key may be a stop
-    stick.stop_asked = stick.arm_asked = False
-    now_s = time.monotonic()
-    velocity_mps, yaw_rate_radps = stick.twist(now_s)
-    if stick.commands(now_s):
-        driver.twist(velocity_mps, yaw_rate_radps)
-    line = f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s  {100 * stick.share:.0f} %  {status}"
-    HANDLER.show(line)
