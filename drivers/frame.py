@@ -26,9 +26,9 @@ _JPEG_CHANNELS = {"Gray": 1, "YCbCr": 3, "RGB": 3}
 _ZEROS_BEFORE_END = re.compile(rb"(?<!\xff)\0+(?=\xff\xd9)")
 _EXTRANEOUS_AT_END = "extraneous bytes before marker 0xd9"
 _PNG_END = b"IEND\xaeB`\x82"
-# Signature, then the chunk IHDR: length, name, width, height, bit depth, colour type (PNG 1.2, 4.1.1).
-_PNG_START = struct.Struct(">8x4x4sIIBB")
-_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
+# In the chunk IHDR, behind the signature, its length and name: width, height, bit depth, colour type (PNG 1.2, 4.1.1).
+_PNG_START = struct.Struct(">16xIIxB")
+_PNG_GREY = 0  # colour type
 # Conversions by encoding without the number of bits, which are 8 or 16 a sample.
 _TO_GRAY = {
     "bgr": cv2.COLOR_BGR2GRAY,
@@ -127,13 +127,12 @@ def _of_png(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     raw = data.tobytes()
     if raw.rfind(_PNG_END) < 0:
         raise ValueError(f"its end is missing after {data.size} bytes")
-    name, width, height, _, colours = _PNG_START.unpack_from(raw.ljust(_PNG_START.size, b"\0"))
-    channels, is_plain = _PNG_CHANNELS.get(colours, 4), name == b"IHDR"
-    _require_samples(width if is_plain else 0, height, channels)
+    width, height, colours = _PNG_START.unpack_from(raw.ljust(_PNG_START.size, b"\0"))
+    _require_samples(width, height, 1 if colours == _PNG_GREY else 4)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise ValueError("its content is corrupt")
-    return _interpolated(frame, frame.bayer if channels == 1 else "", image)
+    return _interpolated(frame, frame.bayer if colours == _PNG_GREY else "", image)
 
 
 def _of_raw(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -12,8 +12,6 @@ import numpy as np
 _MAX_SEGMENTS: Final = 1000
 _FILL: Final = 0xFF
 _TABLES, _SCAN = 0xDB, 0xDA  # markers DQT: quantisation tables; SOS: the header ends here (table B.1)
-_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0 to SOF15, without DHT, JPG and DAC
-_TABLE_OF_FIRST_COMPONENT: Final = 8  # offset in a frame header, after precision, size, number, identifier, sampling
 _BLOCK_PX: Final = 8
 _COEFFICIENTS: Final = _BLOCK_PX * _BLOCK_PX
 # Diagonal by diagonal, in turn up and down (figure A.6): row and column of each coefficient of a table.
@@ -25,20 +23,17 @@ Steps: TypeAlias = tuple[int, ...]
 
 
 def quantisation_steps(data: memoryview) -> Steps:
-    """Return the steps of the 64 coefficients of the first component, in zigzag order; () where they are not found."""
-    tables: dict[int, Steps] = {}
-    table, offset = -1, 2  # after the start of image
+    """Return the steps of the 64 coefficients of luma, in zigzag order, of table 0; () where they are not found."""
+    steps: Steps = ()
+    offset = 2  # after the start of image
     for _ in range(_MAX_SEGMENTS):
         if data[offset : offset + 1] != bytes((_FILL,)) or offset + 4 > len(data):
             break
         marker, length = data[offset + 1], int.from_bytes(data[offset + 2 : offset + 4], "big")
-        segment = bytes(data[offset + 4 : offset + 2 + length])
         if marker == _SCAN:
-            return tables.get(table, ())
+            return steps
         if marker == _TABLES:
-            tables.update(_tables(segment))
-        elif marker in _FRAMES and len(segment) > _TABLE_OF_FIRST_COMPONENT:
-            table = segment[_TABLE_OF_FIRST_COMPONENT]
+            steps = _tables(bytes(data[offset + 4 : offset + 2 + length])).get(0, steps)
         offset += 1 if marker == _FILL else 2 + length
     return ()
 

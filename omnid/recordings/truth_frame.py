@@ -9,7 +9,8 @@ hand-eye calibration (Shah 2013), solved by Gauss-Newton:
 
     A R_truth_body = R_odom_rig R_rig_body,    A bar(p_truth_body) = bar(p_odom_rig) + bar(R_odom_rig) t_rig_body.
 
-What the path does not show, as the height of the lever arm by a drive in a plane, stays 0.
+The lever arm is fitted where it halves the error. What the path does not show, as its height by a drive in a plane,
+stays 0.
 """
 
 from __future__ import annotations
@@ -71,26 +72,36 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
     before_ns, T_before = truth.stamps_ns[after - 1], truth.T[after - 1]
     part = (stamps_ns - before_ns) / (truth.stamps_ns[after] - before_ns)
     T_true = T_before @ se3.exp(se3.log(se3.inverse(T_before) @ truth.T[after]) * part[:, None])
-    # 2. The start: the worlds by the positions, then the rotation of the body.
-    (R, p), (true_R, true_p) = parts(estimate.T[rows]), parts(T_true)
+    # 2. Without a lever arm, unless one leaves less than half of the error.
+    turned, free = _fitted(estimate.T[rows], T_true, 6), _fitted(estimate.T[rows], T_true, 9)
+    return (free if free[1] < turned[1] / 2 else turned)[0]
+
+
+def _fitted(T_est: Array, T_true: Array, unknowns: int) -> tuple[TruthFrame, float]:
+    """Return the body of the truth by poses (N, 4, 4) of the same times, and the error that is left.
+
+    unknowns: 6 without a lever arm, 9 with it.
+    """
+    # 1. The start: the worlds by the positions, then the rotation of the body.
+    (R, p), (true_R, true_p) = parts(T_est), parts(T_true)
     p, true_p, swing = p - p.mean(axis=0), true_p - true_p.mean(axis=0), R - R.mean(axis=0)
     A, _ = rotation_between(true_p, p)
     R_body, t_body = Rotation.from_matrix(np.swapaxes(R, 1, 2) @ A @ true_R).mean().as_matrix(), np.zeros(3)
-    # 3. Gauss-Newton. A rotation counts as the movement of a point at the path's radius, which is the unit of length.
+    # 2. Gauss-Newton. A rotation counts as the movement of a point at the path's radius, which is the unit of length.
     radius = max(float(np.sqrt(np.square(true_p).sum(axis=1).mean())), np.finfo(float).tiny)
-    J, eye = np.zeros((2, len(R), 3, 9)), np.eye(3)
+    J, eye, step, error = np.zeros((2, len(R), 3, 9)), np.eye(3), np.zeros(9), np.zeros(0)
     J[0, :, :, 6:], J[1, :, :, 3:6] = -swing, -eye
     for _ in range(STEPS):
         turned, moved = R @ R_body, true_p @ A.T / radius
         J[0, :, :, :3], J[1, :, :, :3] = np.cross(eye, moved[:, None]).swapaxes(1, 2), np.swapaxes(turned, 1, 2)
-        error = np.stack(
-            [moved - p / radius - swing @ t_body, se3.rotation_log(np.swapaxes(turned, 1, 2) @ A @ true_R)]
-        )
-        step = -np.linalg.pinv(J.reshape(-1, 9), LEAST_SHOWN) @ error.ravel()
+        off = moved - p / radius - swing @ t_body, se3.rotation_log(np.swapaxes(turned, 1, 2) @ A @ true_R)
+        error = np.stack(off).ravel()
+        step[:unknowns] = -np.linalg.pinv(J.reshape(-1, 9)[:, :unknowns], LEAST_SHOWN) @ error
         A, R_body, t_body = se3.rotation_exp(step[:3]) @ A, R_body @ se3.rotation_exp(step[3:6]), t_body + step[6:]
-    # 4. What the path shows.
-    _, shown, Vt = np.linalg.svd(J.reshape(-1, 9), full_matrices=False)
-    hidden = np.abs(Vt[shown < LEAST_SHOWN * shown[0], 6:]).max(axis=0, initial=0.0) > 0.5
-    unknown = ", ".join(axis for axis, is_hidden in zip("xyz", hidden, strict=True) if is_hidden)
-    freedom = int((shown >= LEAST_SHOWN * shown[0]).sum()) - 3
-    return TruthFrame(se3.transform(R_body, radius * t_body), freedom, unknown)
+    # 3. What the path shows.
+    _, shown, Vt = np.linalg.svd(J.reshape(-1, 9)[:, :unknowns], full_matrices=False)
+    is_shown = shown >= LEAST_SHOWN * shown[0]
+    hidden = np.abs(Vt[~is_shown, 6:]).max(axis=0, initial=0.0) > 0.5
+    unknown = ", ".join(axis for axis, is_hidden in zip("xyz", hidden, strict=False) if is_hidden)
+    frame = TruthFrame(se3.transform(R_body, radius * t_body), int(is_shown.sum()) - 3, unknown)
+    return frame, float(np.linalg.norm(error))

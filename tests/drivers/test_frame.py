@@ -178,7 +178,7 @@ def test_damaged_images_raise_only_decode_errors(suffix: str) -> None:
 
 
 @pytest.mark.parametrize(("suffix", "encoding"), [(".jpg", "jpeg"), (".png", "png")])
-@pytest.mark.parametrize(("side", "words"), [(60000, "60000 x 60000"), (5000, "5000 x 5000 px of 3 channels")])
+@pytest.mark.parametrize(("side", "words"), [(60000, "60000 x 60000"), (5000, "5000 x 5000 px of")])
 def test_refuses_images_whose_samples_would_fill_the_memory(suffix: str, encoding: str, side: int, words: str) -> None:
     """Decoders of progressive JPEG and interlaced PNG store the samples of all channels."""
     data = encoded(suffix)
