@@ -29,7 +29,6 @@ from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, STAGE_PREFIX
 from omnid.utc import utc
 from omnid.version import __version__
 
-MAX_EVENTS: Final = 400  # of the table of events
 LEVELS: Final = ("", "warning", "error")
 
 
@@ -160,12 +159,13 @@ def _events_table(events: Sequence[Event], end_s: float) -> list[str]:
     if not events:
         return ["<p>No events: no change of state, no gap, no loss.</p>"]
     rows = []
-    for event in events[:MAX_EVENTS]:
+    for event in events[:MOST_ENTRIES]:
         start, end = (_clock(at_s, end_s) for at_s in (event.start_s, event.end_s))
         text = f"{event.text} ({event.count})" if event.count else event.text
         times = start if start == end else f"{start} to {end}"
         rows.append((times, LEVELS[event.level], escape(event.source), escape(text)))
-    return ["<div class='events'>", table(("time", "", "part", "event (count)"), rows), "</div>"]
+    more = [note(f"and {len(events) - MOST_ENTRIES} more")] if len(events) > MOST_ENTRIES else []
+    return ["<div class='events'>", table(("time", "", "part", "event (count)"), rows), "</div>", *more]
 
 
 def _clock(seconds: float, end_s: float) -> str:
