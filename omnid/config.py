@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from drivers.cameras.v4l2_settings import V4l2Settings
+from drivers.cameras.v4l2_controls import V4l2Settings
 from drivers.errors import DriverError
 from drivers.logs.rotating_log import RotationSettings
 from drivers.logs.streams import TimeSource
@@ -58,8 +58,9 @@ class CamerasConfig:
         "1 ms blurs by 0.16 px in a turn of 45 deg/s (panorama of 1300 columns)",
     ] = 20.0
     exposure_us: Annotated[int, Meta(ge=0, le=10_000_000), "fixed exposure, us; 0: not fixed"] = 0
-    auto_gain: Annotated[Literal["keep", "on", "off"], "automatic gain"] = "keep"
-    gain: Annotated[int, Meta(ge=-1, le=2**31 - 1), "fixed gain in the camera's own units; -1: not fixed"] = -1
+    gain: Annotated[
+        int, Meta(ge=-1, le=2**31 - 1), "fixed gain in the camera's units, automatic off; -1: not fixed"
+    ] = -1
     power_line: Annotated[
         Literal["keep", "off", "50", "60", "auto"], "mains frequency against the flicker of lamps, Hz"
     ] = "keep"

@@ -57,6 +57,7 @@ class CameraExposure:
 
     ranges: ExposureRanges
     request: ExposureRequest | None = None  # the newest; None: none yet
+    done: ExposureRequest | None = None  # the newest that was carried out
     in_force: ExposureSetting | None = None  # None: unknown
     problem: str = ""  # reason for which the device refused a request; no more are carried out until it is opened again
 

@@ -20,7 +20,6 @@ from drivers.logs.streams import MotionTopics
 from drivers.motion import MotionSample
 
 MAX_LOG_BYTES: Final = 1 << 30
-POLL_PERIOD_S: Final = 0.02  # A wait is interrupted with this period to see whether close() was called.
 MAX_DELAY_NS: Final = 100_000_000  # a frame later than that is dropped, as by a camera whose buffers are full
 T = TypeVar("T")
 TimedFrames: TypeAlias = tuple[tuple[int, Frame], ...]  # time since the log's first frame [ns], frame
@@ -83,15 +82,19 @@ class LogImages:
         return self.last_ns + max(1, self.last_ns // (max(len(self.lower), len(self.upper)) - 1))
 
 
-class LogClock:
-    """The time at which a log starts, the same for both cameras: when the first of them begins to deliver.
+class LogPlayback:
+    """A log that is played forwards and backwards in turn, for its cameras and its motion.
 
-    A run that loads for some time before it takes images loses none of them.
+    It starts when the first of them begins to deliver: a run that loads for some time before it takes images loses
+    none of them.
     """
 
-    def __init__(self, epoch_ns: int | None = None) -> None:
-        """epoch_ns: a fixed start of the log [ns of CLOCK_MONOTONIC]."""
-        self._epoch_ns = epoch_ns
+    def __init__(self, images: LogImages, *, pace: float = 1.0, once: bool = False) -> None:
+        """pace: speed relative to the recording; DriverError where it is not above 0. once: play once, forwards."""
+        if not 0 < pace < math.inf:
+            raise DriverError(f"the pace of a log is {pace:g}; give a number above 0; 2 is twice as fast as recorded")
+        self.images, self.pace, self._once = images, pace, once
+        self._epoch_ns: int | None = None
         self._lock = threading.Lock()
 
     def epoch_ns(self) -> int:
@@ -101,81 +104,65 @@ class LogClock:
                 self._epoch_ns = time.monotonic_ns()
             return self._epoch_ns
 
-
-class _Playback:
-    """A part of a log, played forwards and backwards in turn until it is closed.
-
-    clock: start of the log, shared by the cameras and the motion. pace: speed relative to the recording. once: play the
-    log once, forwards. Raises DriverError for a pace that is not above 0.
-    """
-
-    def __init__(self, images: LogImages, clock: LogClock, *, pace: float = 1.0, once: bool = False) -> None:
-        if not 0 < pace < math.inf:
-            raise DriverError(f"the pace of a log is {pace:g}; give a number above 0; 2 is twice as fast as recorded")
-        self._images, self._clock, self._pace, self._once = images, clock, pace, once
-        self._closed = False
-
-    def close(self) -> None:
-        """End the playback; may be called twice, from any thread."""
-        self._closed = True
-
-    def _due(self, entries: Sequence[tuple[int, T]]) -> Iterator[tuple[int, T, int]]:
-        """Yield stamp [ns], entry and direction of the pass when each entry is due, until closed."""
-        epoch_ns = self._clock.epoch_ns()
-        for due_ns, entry, direction in passes_of(entries, self._images, self._once):
-            stamp_ns = epoch_ns + round(due_ns / self._pace)
-            while not self._closed and (left_s := (stamp_ns - time.monotonic_ns()) * 1e-9) > 0:
-                time.sleep(min(left_s, POLL_PERIOD_S))
-            if self._closed:
+    def due(self, entries: Sequence[tuple[int, T]], closed: threading.Event) -> Iterator[tuple[int, T, int]]:
+        """Yield stamp [ns], entry and direction (1, or -1 on the way back) when each entry is due, until closed."""
+        epoch_ns = self.epoch_ns()
+        for at_ns, entry, direction in self._passes(entries):
+            stamp_ns = epoch_ns + round(at_ns / self.pace)
+            if closed.wait(max(0.0, (stamp_ns - time.monotonic_ns()) * 1e-9)):
                 return
             yield stamp_ns, entry, direction
 
+    def _passes(self, entries: Sequence[tuple[int, T]]) -> Iterator[tuple[int, T, int]]:
+        """Yield time since the epoch at pace 1 [ns], entry and direction, pass after pass."""
+        images = self.images
+        for start_ns in count(0, 2 * images.pass_ns):
+            yield from ((start_ns + at_ns, entry, 1) for at_ns, entry in entries)
+            if self._once:
+                return
+            turned_ns = start_ns + images.pass_ns + images.last_ns
+            yield from ((turned_ns - at_ns, entry, -1) for at_ns, entry in reversed(entries))
 
-class LogCamera(_Playback):
-    """One camera of a log.
 
-    The stamp of a frame is the time at which it is due; frames that are due before the construction are not delivered.
-    """
+class LogCamera:
+    """One camera of a log. The stamp of a frame is the time at which it is due."""
 
-    def __init__(
-        self, images: LogImages, camera: Camera, clock: LogClock, *, pace: float = 1.0, once: bool = False
-    ) -> None:
-        super().__init__(images, clock, pace=pace, once=once)
-        self._frames = images.lower if camera == "lower" else images.upper
-        self._created_ns = time.monotonic_ns()
+    def __init__(self, playback: LogPlayback, camera: Camera) -> None:
+        self._playback = playback
+        self._entries = playback.images.lower if camera == "lower" else playback.images.upper
+        self._closed = threading.Event()
         self.state = CameraState(mode="a recorded log")
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames when they are due, until closed; those that are not read in time are dropped and counted."""
-        for seq, (stamp_ns, frame, _) in enumerate(self._due(self._frames)):
+        for seq, (stamp_ns, frame, _) in enumerate(self._playback.due(self._entries, self._closed)):
             if time.monotonic_ns() <= stamp_ns + MAX_DELAY_NS:
                 self.state.status = "streaming"
                 self.state.frames += 1
                 yield replace(frame, seq=seq, stamp_ns=stamp_ns)
             else:
-                self.state.drops += stamp_ns > self._created_ns
+                self.state.drops += 1
         self.state.status = "closed"
 
+    def close(self) -> None:
+        """End the frames; may be called twice, from any thread."""
+        self._closed.set()
 
-class LogMotion(_Playback):
+
+class LogMotion:
     """Wheels and IMU of a log, played as its cameras are: on the way back all rates have the other sign."""
+
+    def __init__(self, playback: LogPlayback) -> None:
+        self._playback, self._closed = playback, threading.Event()
 
     def samples(self) -> Iterator[MotionSample]:
         """Yield the samples when they are due, until closed."""
-        for stamp_ns, sample, direction in self._due(self._images.motion) if self._images.motion else ():
+        motion = self._playback.images.motion
+        for stamp_ns, sample, direction in self._playback.due(motion, self._closed) if motion else ():
             rates = [name for name in sample.__slots__ if name.endswith("ps")]
-            faster = {name: direction * self._pace * getattr(sample, name) for name in rates}
+            faster = {name: direction * self._playback.pace * getattr(sample, name) for name in rates}
             yield replace(sample, stamp_ns=stamp_ns, **faster)
 
-
-def passes_of(entries: Sequence[tuple[int, T]], images: LogImages, once: bool) -> Iterator[tuple[int, T, int]]:
-    """Yield the entries of a log pass after pass, every second pass backwards.
-
-    Each has its time since the epoch at pace 1 [ns], and the direction of the pass: 1, or -1 backwards. once: one pass.
-    """
-    for start_ns in count(0, 2 * images.pass_ns):
-        yield from ((start_ns + at_ns, entry, 1) for at_ns, entry in entries)
-        if once:
-            return
-        turned_ns = start_ns + images.pass_ns + images.last_ns
-        yield from ((turned_ns - at_ns, entry, -1) for at_ns, entry in reversed(entries))
+    def close(self) -> None:
+        """End the samples; may be called twice, from any thread."""
+        self._closed.set()

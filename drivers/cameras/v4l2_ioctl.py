@@ -26,7 +26,6 @@ TIMESTAMP_MONOTONIC: Final = 0x2000  # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC
 NEXT_CONTROL: Final = 0x80000000  # V4L2_CTRL_FLAG_NEXT_CTRL
 CONTROL_DISABLED: Final = 0x01  # V4L2_CTRL_FLAG_DISABLED
 CONTROL_READ_ONLY: Final = 0x04  # V4L2_CTRL_FLAG_READ_ONLY
-CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER_MENU = 1, 2, 3, 9  # enum v4l2_ctrl_type
 
 Int32 = ctypes.c_int32
 _u32 = ctypes.c_uint32
@@ -112,12 +111,6 @@ class QueryControl(ctypes.Structure):
     _fields_ = (*_words("id type"), ("name", ctypes.c_char * 32), *_values, *_words("flags reserved1 reserved2"))
 
 
-class QueryMenu(ctypes.Structure):
-    """struct v4l2_querymenu; of an integer menu the first 8 bytes of name are a number."""
-
-    _fields_ = (*_words("id index"), ("name", ctypes.c_char * 32), ("reserved", _u32))
-
-
 class V4l2Control(ctypes.Structure):
     """struct v4l2_control."""
 
@@ -133,20 +126,17 @@ def _request(direction: int, number: int, argument: type[ctypes.Structure] | typ
 
 
 QUERYCAP: Final = _request(_READ, 0, Capability)
-G_FMT: Final = _request(_READ | _WRITE, 4, Format)
 S_FMT: Final = _request(_READ | _WRITE, 5, Format)
 REQBUFS: Final = _request(_READ | _WRITE, 8, BufferRequest)
 QUERYBUF: Final = _request(_READ | _WRITE, 9, V4l2Buffer)
 QBUF: Final = _request(_READ | _WRITE, 15, V4l2Buffer)
 DQBUF: Final = _request(_READ | _WRITE, 17, V4l2Buffer)
 STREAMON: Final = _request(_WRITE, 18, Int32)
-STREAMOFF: Final = _request(_WRITE, 19, Int32)
 G_PARM: Final = _request(_READ | _WRITE, 21, StreamParameters)
 S_PARM: Final = _request(_READ | _WRITE, 22, StreamParameters)
 G_CTRL: Final = _request(_READ | _WRITE, 27, V4l2Control)
 S_CTRL: Final = _request(_READ | _WRITE, 28, V4l2Control)
 QUERYCTRL: Final = _request(_READ | _WRITE, 36, QueryControl)
-QUERYMENU: Final = _request(_READ | _WRITE, 37, QueryMenu)
 
 
 def call(fd: int, request: int, argument: ctypes.Structure | Int32) -> None:

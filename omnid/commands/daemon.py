@@ -18,7 +18,7 @@ from calib import se3
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from calib.se2_arrays import transform
-from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
+from drivers.cameras.log_camera import LogCamera, LogImages, LogMotion, LogPlayback
 from drivers.frame import Camera
 from drivers.logs.log_reader import LogReader
 from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, settings_of
@@ -89,15 +89,15 @@ def _run_log(args: argparse.Namespace, config: Config) -> int:
     images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config), config.cameras.bits)
     for warning in images.warnings:
         log(logging.WARNING, warning)
-    clocks: list[LogClock] = []  # one for each time that both cameras are opened, the lower one first
+    playbacks: list[LogPlayback] = []  # one for each time that both cameras are opened, the lower one first
 
     def open_camera(camera: Camera) -> LogCamera:
         if camera == "lower":
-            clocks.append(LogClock())
-        return LogCamera(images, camera, clocks[-1], pace=args.pace, once=args.once)
+            playbacks.append(LogPlayback(images, pace=args.pace, once=args.once))
+        return LogCamera(playbacks[-1], camera)
 
     def open_motion() -> LogMotion:
-        return LogMotion(images, clocks[-1], pace=args.pace, once=args.once)
+        return LogMotion(playbacks[-1])
 
     rig = None
     if not args.rig:

@@ -15,8 +15,8 @@ from pathlib import Path
 from calib.atomic_file import write_file
 from calib.rig_file import png
 from drivers.cameras.v4l2_camera import V4l2Camera
+from drivers.cameras.v4l2_controls import V4l2Settings
 from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
-from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.frame import CAMERAS as SIDES
 from drivers.frame import Camera, gray
 from drivers.motors.protocols.protocol_registry import motor_protocol
@@ -182,9 +182,8 @@ def show_cameras(args: argparse.Namespace) -> int:
     if not devices:
         return failed("no cameras: the kernel has no capture device; check the cables and the output of `dmesg`")
     for device in devices:
-        print(f"{device.node}  {device.name}  ({', '.join(filter(None, (device.driver, device.bus)))})")
-        exposure = device.exposure or "no exposure time to set"
-        for line in filter(None, (device.by_path, device.by_id, device.problem or exposure)):
+        print(f"{device.node}  {device.name}")
+        for line in filter(None, (device.by_path, device.problem)):
             print(f"  {line}")
     print(f"\nThe modes of a camera: v4l2-ctl -d {devices[0].node} --list-formats-ext")
     if rules := list(udev_rules(devices)):

@@ -17,8 +17,8 @@ from typing import Final, Literal, NamedTuple
 
 from calib.errors import CalibError
 from calib.rig_file import read_rig
-from drivers.cameras.v4l2_device import CaptureDevice, offered_image
-from drivers.cameras.v4l2_settings import V4l2Settings
+from drivers.cameras.v4l2_controls import V4l2Settings
+from drivers.cameras.v4l2_device import CaptureDevice
 from drivers.errors import DriverError
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.config import RecordConfig
@@ -68,14 +68,10 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
             yield Finding("error", subject, f"{settings.device} is no camera", "choose one of `omnid cameras`")
         elif closed := access(subject, path):
             yield closed
+        elif device.problem:
+            yield Finding("error", subject, device.problem, "change section [cameras] of the configuration")
         else:
-            try:
-                if device.problem:
-                    raise DriverError(device.problem)
-                image = str(offered_image(settings) or "in use, so that its image was not tried")
-                yield Finding("ok", subject, f"{device.name} at {device.node}, {image}")
-            except DriverError as fault:
-                yield Finding("error", subject, str(fault), "change section [cameras] of the configuration")
+            yield Finding("ok", subject, f"{device.name} at {device.node}")
     if len({path.resolve() for path in names.values()}) < len(names):
         advice = "configure one for each, see `omnid cameras`"
         yield Finding("error", "cameras", "both names lead to one device", advice)

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from calib.rig_file import read_rig
-from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
+from drivers.cameras.log_camera import LogCamera, LogImages, LogPlayback
 from drivers.frame import Camera, Frame, gray
 from omnid.config import load_config
 from omnid.runs.live import ConnectedRobot, LiveRun
@@ -31,10 +31,10 @@ TIME, TIME_NS = time.time, time.time_ns
 class FaultyCamera(LogCamera):
     """A camera of a log with a fault in its images."""
 
-    def __init__(self, images: LogImages, camera: Camera, clock: LogClock, faults: dict[str, str]) -> None:
-        super().__init__(images, camera, clock)
+    def __init__(self, playback: LogPlayback, camera: Camera, faults: dict[str, str]) -> None:
+        super().__init__(playback, camera)
         self._camera, self._faults = camera, faults
-        first = gray((images.lower if camera == "lower" else images.upper)[0][1])
+        first = gray(self._entries[0][1])
         self._size, self._dark = first.shape, np.random.default_rng(len(camera))
         self._last = b""  # image without a fault
         self._rng = random.Random(1)
@@ -85,11 +85,11 @@ def main() -> int:
     args = parser.parse_args()
     faults: dict[str, str] = {}
     threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
-    images, clock = LogImages.load(args.log), LogClock(time.monotonic_ns())
+    playback = LogPlayback(LogImages.load(args.log))
     config = load_config(None, ["controller.motion.check=false", *args.settings, f"motor.port={args.motor}"])
     live = LiveRun(
         config,
-        ConnectedRobot(lambda camera: FaultyCamera(images, camera, clock, faults)),
+        ConnectedRobot(lambda camera: FaultyCamera(playback, camera, faults)),
         lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True),
         read_rig(args.rig),
     )

@@ -116,9 +116,9 @@ class Vesc:
         packets = packet(commands[0]) + packet(forwarded(self._drive.can_id, commands[1]))
         query = struct.pack(">BI", GET_VALUES_SELECTIVE, MASK)
         (_, first), (_, second) = yield from self._query_both(query, _values, packets)
-        erpms, volts, faults, expired = zip(first, second, strict=True)
-        velocity_mps, yaw_rate_radps = self._drive.motion(*(erpm / erpm_per_mps for erpm in erpms))
-        return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, any(expired), faults[0] or faults[1], min(volts))
+        velocity_mps, yaw_rate_radps = self._drive.motion(first[0] / erpm_per_mps, second[0] / erpm_per_mps)
+        battery_v, fault, expired = min(first[1], second[1]), first[2] or second[2], first[3] or second[3]
+        return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, expired, fault, battery_v)
 
     def _query_both(
         self, query: bytes, parse: Callable[[bytes], tuple[int, T] | None], commands: bytes = b""

@@ -12,29 +12,27 @@ from pathlib import Path
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.v4l2_controls import AUTO_EXPOSURE, AUTO_GAIN, EXPOSURE, EXPOSURE_MAY_SLOW, GAIN
 
-INTEGER, BOOLEAN, MENU = v4l2.CONTROL_INTEGER, v4l2.CONTROL_BOOLEAN, v4l2.CONTROL_MENU
 APERTURE_PRIORITY = 3
 CONTRAST = 0x00980901
 
 
 class FakeCamera:
-    """Exposure and gain are refused while their mode is automatic; a mode that is not offered becomes another one."""
+    """Exposure and gain are refused while their mode is automatic."""
 
     def __init__(self, path: Path | None = None) -> None:
-        self.controls = {  # id: name, kind, low, high, step
-            GAIN: ("Gain", INTEGER, 0, 255, 5),
-            AUTO_GAIN: ("Gain, Automatic", BOOLEAN, 0, 1, 1),
-            AUTO_EXPOSURE: ("Auto Exposure", MENU, 0, 3, 1),
-            EXPOSURE: ("Exposure Time, Absolute", INTEGER, 3, 2047, 1),
-            EXPOSURE_MAY_SLOW: ("Exposure, Dynamic Framerate", BOOLEAN, 0, 1, 1),
-            CONTRAST: ("Contrast", INTEGER, -64, 64, 1),
+        self.controls = {  # id: name, low, high, step
+            GAIN: ("Gain", 0, 255, 5),
+            AUTO_GAIN: ("Gain, Automatic", 0, 1, 1),
+            AUTO_EXPOSURE: ("Auto Exposure", 0, 3, 1),
+            EXPOSURE: ("Exposure Time, Absolute", 3, 2047, 1),
+            EXPOSURE_MAY_SLOW: ("Exposure, Dynamic Framerate", 0, 1, 1),
+            CONTRAST: ("Contrast", -64, 64, 1),
         }
         self.values = dict.fromkeys(self.controls, 1) | {GAIN: 65, AUTO_EXPOSURE: APERTURE_PRIORITY, EXPOSURE: 156}
         self.menu = (1, APERTURE_PRIORITY)
         self.written: list[tuple[int, int]] = []
         self.failing = 0  # errno of every call but those that enumerate
         self.modes = {("YUYV", 640, 480): 30.0, ("YUYV", 1280, 960): 7.5, ("MJPG", 1280, 960): 30.0}
-        self.bus_info = b"usb-1"
         self.filled: deque[tuple[bytes, int, int, int]] = deque()  # bytes, sequence, stamp [ns], flags
         self._mode, self._rate_hz = ("YUYV", 640, 480), 30.0
         if path is not None:
@@ -47,17 +45,14 @@ class FakeCamera:
 
     def call(self, fd: int, request: int, argument: ctypes.Structure) -> None:
         """Answer a call as the kernel does."""
-        enumerates = request in (v4l2.QUERYCTRL, v4l2.QUERYMENU)
-        if self.failing and not enumerates:
+        if self.failing and request != v4l2.QUERYCTRL:
             raise OSError(self.failing, os.strerror(self.failing))
         {
             v4l2.QUERYCAP: self._query_capability,
             v4l2.S_FMT: self._set_format,
-            v4l2.G_FMT: self._get_format,
             v4l2.S_PARM: self._set_rate,
             v4l2.G_PARM: self._get_rate,
             v4l2.QUERYCTRL: self._query_control,
-            v4l2.QUERYMENU: self._query_menu,
             v4l2.G_CTRL: self._get_control,
             v4l2.S_CTRL: self._set_control,
             v4l2.QUERYBUF: self._query_buffer,
@@ -66,7 +61,6 @@ class FakeCamera:
 
     def _query_capability(self, found: ctypes.Structure) -> None:
         found.device_caps = found.capabilities = v4l2.CAP_VIDEO_CAPTURE | v4l2.CAP_STREAMING | v4l2.CAP_DEVICE_CAPS
-        found.driver, found.bus_info = b"uvcvideo", self.bus_info
 
     def _set_format(self, wanted: ctypes.Structure) -> None:
         pix = wanted.fmt.pix
@@ -74,10 +68,8 @@ class FakeCamera:
         others = [other for other in self.modes if other[0] == mode[0]] or list(self.modes)
         self._mode = mode if mode in self.modes else others[0]
         self._rate_hz = self.modes[self._mode]
-
-    def _get_format(self, found: ctypes.Structure) -> None:
-        name, found.fmt.pix.width, found.fmt.pix.height = self._mode
-        found.fmt.pix.pixelformat = v4l2.fourcc_code(name)
+        name, pix.width, pix.height = self._mode
+        pix.pixelformat = v4l2.fourcc_code(name)
 
     def _set_rate(self, wanted: ctypes.Structure) -> None:
         interval = wanted.timeperframe
@@ -92,12 +84,8 @@ class FakeCamera:
         if not following:
             raise OSError(errno.EINVAL, "no more")
         entry.id = following[0]
-        name, entry.type, entry.minimum, entry.maximum, entry.step = self.controls[following[0]]
+        name, entry.minimum, entry.maximum, entry.step = self.controls[following[0]]
         entry.name, entry.flags = name.encode(), 0
-
-    def _query_menu(self, item: ctypes.Structure) -> None:
-        if item.index not in self.menu:
-            raise OSError(errno.EINVAL, "no such entry")
 
     def _get_control(self, control: ctypes.Structure) -> None:
         control.value = self.values[control.id]
@@ -106,6 +94,8 @@ class FakeCamera:
         automatic = {EXPOSURE: self.values[AUTO_EXPOSURE] != 1, GAIN: self.values.get(AUTO_GAIN) == 1}
         if automatic.get(control.id):
             raise OSError(errno.EACCES, "refused")
+        if control.id == AUTO_EXPOSURE and control.value not in self.menu:
+            raise OSError(errno.EINVAL, "not offered")
         self.values[control.id] = control.value
         self.written.append((control.id, control.value))
 

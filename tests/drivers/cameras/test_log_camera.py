@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogClock, LogImages, LogMotion, passes_of
-from drivers.frame import Camera, Frame
+from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogImages, LogMotion, LogPlayback
+from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from drivers.motion import GyroSample, WheelSample
 from tests.conftest import PAIRS
@@ -23,29 +25,26 @@ def recorded(scene: Path) -> LogImages:
     return LogImages.load(scene / "log.mcap")
 
 
-def stamps(recorded: LogImages, camera: Camera, count: int) -> list[int]:
-    """Return the due times of a camera at pace 1 [ns], without waiting."""
-    entries = recorded.lower if camera == "lower" else recorded.upper
-    return [at_ns for at_ns, _, _ in islice(passes_of(entries, recorded, once=False), count)]
-
-
 def test_the_images_are_those_of_the_log(scene: Path, recorded: LogImages) -> None:
-    epoch_ns = time.monotonic_ns()
-    seen: list[Frame] = list(LogCamera(recorded, "upper", LogClock(epoch_ns), pace=FAST, once=True).frames())
-    reader = LogReader(scene / "log.mcap")
-    frames = list(reader.frames())
-    reader.close()
+    playback = LogPlayback(recorded, pace=FAST, once=True)
+    seen: list[Frame] = list(LogCamera(playback, "upper").frames())
+    with closing(LogReader(scene / "log.mcap")) as reader:
+        frames = list(reader.frames())
     expected = [frame for frame in frames if frame.camera == "upper"]
     assert [frame.seq for frame in seen] == list(range(PAIRS))
     assert [bytes(frame.data) for frame in seen] == [bytes(frame.data) for frame in expected]
     for frame, original in zip(seen, expected, strict=True):
         since_ns = (original.stamp_ns - frames[0].stamp_ns) / FAST
-        assert frame.stamp_ns == pytest.approx(epoch_ns + since_ns, abs=1)
+        assert frame.stamp_ns == pytest.approx(playback.epoch_ns() + since_ns, abs=1)
 
 
 def test_plays_forwards_and_backwards_at_even_intervals(recorded: LogImages) -> None:
-    passes = 6
-    lower, upper = (stamps(recorded, name, passes * PAIRS) for name in ("lower", "upper"))  # type: ignore[arg-type]
+    pace, open_end = 1000.0, threading.Event()
+    playback = LogPlayback(recorded, pace=pace)
+    lower, upper = (
+        [pace * stamp_ns for stamp_ns, _, _ in islice(playback.due(entries, open_end), 6 * PAIRS)]
+        for entries in (recorded.lower, recorded.upper)
+    )
     steps_ns = [b - a for a, b in pairwise(lower)]
     assert min(steps_ns) > 80e6 and max(steps_ns) < 120e6
     apart_ns = [abs(a - b) for a, b in zip(lower, upper, strict=True)]
@@ -55,21 +54,21 @@ def test_plays_forwards_and_backwards_at_even_intervals(recorded: LogImages) -> 
 def test_wheels_and_gyro_are_played_with_the_images_and_backwards_on_the_way_back(recorded: LogImages) -> None:
     samples = (WheelSample(0, 0.3, 0.1), GyroSample(0, 0.0, -0.1, 0.2))
     log = replace(recorded, motion=tuple(zip((10_000_000, 50_000_000), samples, strict=True)))
-    source = LogMotion(log, LogClock(epoch_ns := time.monotonic_ns()), pace=FAST)
+    source = LogMotion(playback := LogPlayback(log, pace=FAST))
     first, second, third, fourth = islice(source.samples(), 4)
+    epoch_ns = playback.epoch_ns()
     assert first == WheelSample(epoch_ns + round(10e6 / FAST), FAST * 0.3, FAST * 0.1)
     assert second == GyroSample(epoch_ns + round(50e6 / FAST), 0.0, -0.1 * FAST, 0.2 * FAST)
     assert isinstance(third, GyroSample) and isinstance(fourth, WheelSample)
     assert (third.z_radps, fourth.velocity_mps) == pytest.approx((-0.2 * FAST, -0.3 * FAST))
     assert third.stamp_ns == epoch_ns + round((recorded.pass_ns + recorded.last_ns - 50e6) / FAST)
-    assert fourth.stamp_ns - third.stamp_ns == pytest.approx(40e6 / FAST, abs=2)
-    assert len(list(LogMotion(log, LogClock(), pace=FAST, once=True).samples())) == 2
+    assert len(list(LogMotion(LogPlayback(log, pace=FAST, once=True)).samples())) == 2
     source.close()
-    assert list(source.samples()) == list(LogMotion(recorded, LogClock()).samples()) == []
+    assert list(source.samples()) == list(LogMotion(LogPlayback(recorded)).samples()) == []
 
 
 def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) -> None:
-    camera = LogCamera(recorded, "lower", LogClock(), pace=FAST)
+    camera = LogCamera(LogPlayback(recorded, pace=FAST), "lower")
     frames = camera.frames()
     first = next(frames)
     time.sleep(0.4)
@@ -80,10 +79,9 @@ def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) 
 
 def test_a_log_starts_when_the_first_camera_is_read(recorded: LogImages) -> None:
     """A run may load for longer than the log lasts before it takes the first image."""
-    clock = LogClock()
-    cameras = [LogCamera(recorded, name, clock, pace=1000, once=True) for name in ("lower", "upper")]
+    playback = LogPlayback(recorded, pace=1000, once=True)
+    cameras = [LogCamera(playback, name) for name in ("lower", "upper")]
     streams = [camera.frames() for camera in cameras]
     read_ns = time.monotonic_ns()
     first = next(streams[1])
-    assert first.stamp_ns >= clock.epoch_ns() >= read_ns
-    assert clock.epoch_ns() == clock.epoch_ns() and cameras[0].state.frames == 0
+    assert first.stamp_ns >= playback.epoch_ns() >= read_ns and cameras[0].state.frames == 0

@@ -8,6 +8,7 @@ import logging
 import runpy
 import threading
 import time
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,35 +23,33 @@ from drivers.cameras.camera_state import (
     ExposureRequest,
     ExposureSetting,
 )
-from drivers.cameras.v4l2_camera import BufferAccounting, StampValidator, V4l2Camera
+from drivers.cameras.v4l2_camera import BufferChecks, V4l2Camera
 from drivers.cameras.v4l2_controls import (
     AUTO_EXPOSURE,
     AUTO_GAIN,
     EXPOSURE,
     EXPOSURE_MAY_SLOW,
     GAIN,
-    ExposureControls,
-    apply_controls,
-    list_controls,
-    plan_controls,
+    V4l2Settings,
+    exposure_ranges,
+    follow_request,
+    set_controls,
 )
 from drivers.cameras.v4l2_device import (
+    V4l2Stream,
     capture_devices,
-    offered_image,
     udev_rules,
 )
-from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from omnid.cli import main
 from omnid.commands import machine
-from tests.drivers.cameras.fake_camera import APERTURE_PRIORITY, FakeCamera
+from tests.drivers.cameras.fake_camera import APERTURE_PRIORITY, CONTRAST, FakeCamera
 from tests.waiting import wait_until
 
 SIZES = {  # struct v4l2_...: (64 bits, 32 bits)
     "Capability": (104, 104), "PixelFormat": (48, 48), "Format": (208, 204), "StreamParameters": (204, 204),
-    "BufferRequest": (20, 20), "V4l2Buffer": (88, 68), "QueryControl": (68, 68), "QueryMenu": (44, 44),
-    "V4l2Control": (8, 8),
+    "BufferRequest": (20, 20), "V4l2Buffer": (88, 68), "QueryControl": (68, 68), "V4l2Control": (8, 8),
 }  # fmt: skip
 OFFSETS = {
     ("V4l2Buffer", "flags"): (12, 12), ("V4l2Buffer", "timestamp"): (24, 20), ("V4l2Buffer", "sequence"): (56, 44),
@@ -58,12 +57,10 @@ OFFSETS = {
     ("StreamParameters", "capability"): (4, 4), ("StreamParameters", "timeperframe"): (12, 12),
 }  # fmt: skip
 REQUESTS = {
-    "QUERYCAP": (0x80685600, 0x80685600), "G_FMT": (0xC0D05604, 0xC0CC5604),
-    "S_FMT": (0xC0D05605, 0xC0CC5605), "REQBUFS": (0xC0145608, 0xC0145608), "QUERYBUF": (0xC0585609, 0xC0445609),
-    "QBUF": (0xC058560F, 0xC044560F), "DQBUF": (0xC0585611, 0xC0445611), "STREAMON": (0x40045612, 0x40045612),
-    "STREAMOFF": (0x40045613, 0x40045613), "G_PARM": (0xC0CC5615, 0xC0CC5615), "S_PARM": (0xC0CC5616, 0xC0CC5616),
+    "QUERYCAP": (0x80685600, 0x80685600), "S_FMT": (0xC0D05605, 0xC0CC5605), "REQBUFS": (0xC0145608, 0xC0145608),
+    "QUERYBUF": (0xC0585609, 0xC0445609), "QBUF": (0xC058560F, 0xC044560F), "DQBUF": (0xC0585611, 0xC0445611),
+    "STREAMON": (0x40045612, 0x40045612), "G_PARM": (0xC0CC5615, 0xC0CC5615), "S_PARM": (0xC0CC5616, 0xC0CC5616),
     "G_CTRL": (0xC008561B, 0xC008561B), "S_CTRL": (0xC008561C, 0xC008561C), "QUERYCTRL": (0xC0445624, 0xC0445624),
-    "QUERYMENU": (0xC02C5625, 0xC02C5625),
 }  # fmt: skip
 
 
@@ -85,47 +82,33 @@ def test_structures_and_requests_are_the_kernels(abi: tuple[dict[str, Any], int]
 PORT = "pci-0000:00:14.0-usb-0:1:1.0"
 
 
-def plug(root: Path, node: str, *, name: str, port: str, index: int = 0) -> None:
-    """Create the entries of a camera as the kernel does; its device is an ordinary file."""
-    device = root / "sys/devices" / port
-    device.mkdir(parents=True, exist_ok=True)
-    (root / "sys/bus/usb/drivers/uvcvideo").mkdir(parents=True, exist_ok=True)
-    if not (device / "driver").is_symlink():
-        (device / "driver").symlink_to(root / "sys/bus/usb/drivers/uvcvideo")
-    entry = root / "sys/class/video4linux" / node
+def plug(root: Path, number: int, port: str, index: int = 0) -> None:
+    """Create the entries of a node of a camera as the kernel and udev do; its device is an ordinary file."""
+    entry = root / f"sys/class/video4linux/video{number}"
     entry.mkdir(parents=True)
-    (entry / "name").write_text(f"{name}\n")
+    (entry / "name").write_text("HD Webcam\n")
     (entry / "index").write_text(f"{index}\n")
-    (entry / "device").symlink_to(device)
-    (root / "dev").mkdir(exist_ok=True)
-    (root / "dev" / node).touch()
-
-
-def link(root: Path, folder: str, name: str, node: str) -> None:
-    (root / "dev/v4l" / folder).mkdir(parents=True, exist_ok=True)
-    (root / "dev/v4l" / folder / name).symlink_to(f"../../{node}")
+    (root / "dev/v4l/by-path").mkdir(parents=True, exist_ok=True)
+    (root / f"dev/video{number}").touch()
+    for name in (port, port.replace("-usb-", "-usbv2-")):  # a newer udev makes two links for a port
+        (root / f"dev/v4l/by-path/{name}-video-index{index}").symlink_to(f"../../video{number}")
 
 
 @pytest.fixture
 def two_webcams(tmp_path: Path) -> Path:
-    """Two cameras of one model, each with a metadata node, and the links of a newer udev, two for a port."""
+    """Two cameras of one model, each with a metadata node."""
     for number, port in ((2, PORT), (10, PORT.replace("0:1:", "0:2:"))):
-        plug(tmp_path, f"video{number}", name="HD Webcam", port=port)
-        plug(tmp_path, f"video{number + 1}", name="HD Webcam", port=port, index=1)
-        link(tmp_path, "by-path", f"{port.replace('-usb-', '-usbv2-')}-video-index0", f"video{number}")
-        link(tmp_path, "by-path", f"{port}-video-index0", f"video{number}")
-        link(tmp_path, "by-path", f"{port}-video-index1", f"video{number + 1}")
-    link(tmp_path, "by-id", "usb-Maker_HD_Webcam-video-index0", "video10")
+        plug(tmp_path, number, port)
+        plug(tmp_path, number + 1, port, index=1)
     return tmp_path
 
 
 def test_finds_cameras_by_number_without_metadata_nodes(two_webcams: Path) -> None:
     found = capture_devices(two_webcams)
-    assert [(device.node, device.name, device.driver) for device in found] == [
-        ("/dev/video2", "HD Webcam", "uvcvideo"), ("/dev/video10", "HD Webcam", "uvcvideo"),
+    assert [(device.node, device.name) for device in found] == [
+        ("/dev/video2", "HD Webcam"), ("/dev/video10", "HD Webcam"),
     ]  # fmt: skip
-    assert found[0].by_path == f"/dev/v4l/by-path/{PORT}-video-index0" and found[0].by_id == ""
-    assert found[1].by_id == "/dev/v4l/by-id/usb-Maker_HD_Webcam-video-index0"
+    assert found[0].by_path == f"/dev/v4l/by-path/{PORT}-video-index0"
     (two_webcams / "dev/video10").unlink()
     first, second = capture_devices(two_webcams)
     assert "is not a video device" in first.problem and "is not there" in second.problem
@@ -145,7 +128,7 @@ def test_the_command_lists_the_cameras(
     monkeypatch.setattr(v4l2, "call", FakeCamera().call)
     assert main(["cameras"]) == 0
     printed = capsys.readouterr().out
-    assert "/dev/video2  HD Webcam  (uvcvideo, usb-1)" in printed and "  exposure 0.3 to 204.7 ms" in printed
+    assert "/dev/video2  HD Webcam\n" in printed
     assert "v4l2-ctl -d /dev/video2 --list-formats-ext" in printed
     assert "/etc/udev/rules.d/" in printed and "omnid/upper" in printed
     monkeypatch.setattr(machine, "ROOT", two_webcams / "none")
@@ -154,12 +137,12 @@ def test_the_command_lists_the_cameras(
     assert missing.out == "" and missing.err.startswith("omnid: no cameras") and missing.err.count("\n") == 1
 
 
-def image(camera: FakeCamera, path: Path, **fields: Any) -> str:
+def image(path: Path, **fields: Any) -> str:
     """Return the image that a camera gives with these settings."""
-    path.touch()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(v4l2, "call", camera.call)
-        return str(offered_image(V4l2Settings(str(path), **fields)))
+        patch.setattr(v4l2, "call", FakeCamera(path).call)
+        with closing(V4l2Stream(V4l2Settings(str(path), **fields))) as stream:
+            return str(stream.image)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +156,7 @@ def image(camera: FakeCamera, path: Path, **fields: Any) -> str:
 def test_auto_prefers_a_format_without_decoding_if_it_is_fast_enough(
     tmp_path: Path, fields: dict[str, Any], expected: str
 ) -> None:
-    assert image(FakeCamera(), tmp_path / "video", **fields) == expected
+    assert image(tmp_path / "video", **fields) == expected
 
 
 @pytest.mark.parametrize(
@@ -188,23 +171,8 @@ def test_refuses_other_modes_and_names_what_the_device_sets(
     tmp_path: Path, fields: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(DriverError, match=message) as caught:
-        image(FakeCamera(), tmp_path / "video", **fields)
+        image(tmp_path / "video", **fields)
     assert "--list-formats-ext" in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("device", "fields"),
-    [
-        ("0", {}),
-        *(("/dev/omnid/lower", {"controls": (text,)}) for text in ("gain", "gain=high", "=3")),
-        ("/dev/omnid/lower", {"auto_gain": "on", "gain": 3}),
-        ("/dev/omnid/lower", {"auto_exposure": "on", "exposure_us": 100}),
-    ],
-)
-def test_refuses_settings_that_contradict_each_other_in_one_line(device: str, fields: dict[str, Any]) -> None:
-    with pytest.raises(DriverError, match=rf"^camera {device}: .*give ") as caught:
-        V4l2Settings(device, **fields)
-    assert "\n" not in str(caught.value)
 
 
 FD = 1000
@@ -217,9 +185,10 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
     return made
 
 
-def plan(**fields: Any) -> list[tuple[str, int]]:
-    settings = V4l2Settings("/dev/omnid/lower", **fields)
-    return [(control.name, value) for control, value in plan_controls(settings, list_controls(FD))]
+def written(camera: FakeCamera, **fields: Any) -> list[tuple[int, int]]:
+    """Return the controls that settings set, in order."""
+    set_controls(FD, V4l2Settings("/dev/omnid/lower", **fields))
+    return camera.written
 
 
 @pytest.mark.parametrize(
@@ -228,96 +197,88 @@ def plan(**fields: Any) -> list[tuple[str, int]]:
         ({}, []),
         (
             {"exposure_us": 10_040, "gain": 15},
-            [
-                ("auto_exposure", 1),
-                ("exposure_dynamic_framerate", 0),
-                ("gain_automatic", 0),
-                ("exposure_time_absolute", 100),
-                ("gain", 15),
-            ],
+            [(AUTO_EXPOSURE, 1), (EXPOSURE_MAY_SLOW, 0), (EXPOSURE, 100), (AUTO_GAIN, 0), (GAIN, 15)],
         ),
-        ({"auto_exposure": "on"}, [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]),
-        ({"auto_exposure": "rig"}, [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]),
-        ({"controls": ("contrast = -3",)}, [("contrast", -3)]),
+        ({"auto_exposure": "rig", "exposure_us": 5000}, [(AUTO_EXPOSURE, 1), (EXPOSURE_MAY_SLOW, 0), (EXPOSURE, 50)]),
+        ({"auto_exposure": "on"}, [(AUTO_EXPOSURE, APERTURE_PRIORITY), (EXPOSURE_MAY_SLOW, 0)]),
+        ({"auto_exposure": "rig"}, [(AUTO_EXPOSURE, APERTURE_PRIORITY), (EXPOSURE_MAY_SLOW, 0), (AUTO_GAIN, 1)]),
+        ({"controls": ("contrast = -3",)}, [(CONTRAST, -3)]),
     ],
 )
 def test_automatic_modes_come_before_the_values_that_they_govern(
-    camera: FakeCamera, fields: dict[str, Any], expected: list[tuple[str, int]]
+    camera: FakeCamera, fields: dict[str, Any], expected: list[tuple[int, int]]
 ) -> None:
-    assert plan(**fields) == expected
+    assert written(camera, **fields) == expected
 
 
 def test_what_a_camera_lacks_is_needed_only_where_it_is_asked_for(camera: FakeCamera) -> None:
     camera.menu = (0, 1, 3)
-    assert plan(auto_exposure="on")[0] == ("auto_exposure", 0)
+    assert written(camera, auto_exposure="on")[0] == (AUTO_EXPOSURE, 0)
     del camera.controls[AUTO_GAIN], camera.controls[AUTO_EXPOSURE], camera.controls[EXPOSURE_MAY_SLOW]
-    assert plan(gain=15) == [("gain", 15)] and plan(auto_exposure="rig") == []
-    for fields, name in (({"auto_gain": "off"}, "automatic gain"), ({"power_line": "50"}, "power line frequency")):
-        with pytest.raises(DriverError, match=f"no control of its {name}"):
-            plan(**fields)
+    camera.written.clear()
+    assert written(camera, auto_exposure="rig") == []
+    for fields, name in (
+        ({"power_line": "50"}, "power_line"),
+        ({"exposure_us": 100}, "auto_exposure"),
+        ({"controls": ("sharpness=1",)}, "controls: sharpness"),
+    ):
+        with pytest.raises(DriverError, match=f"no control for cameras.{name}. It has: contrast, gain"):
+            written(camera, **fields)
 
 
-def test_refuses_a_control_that_the_camera_does_not_have(camera: FakeCamera) -> None:
-    with pytest.raises(DriverError, match=r"no control 'sharpness'\. It has: contrast, gain_automatic"):
-        plan(controls=("sharpness=1",))
-
-
-def test_controls_are_set_in_order_and_read_back(camera: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = V4l2Settings("/dev/x", auto_exposure="rig", exposure_us=5000)
-    assert not settings.is_regulated and V4l2Settings("/dev/x", auto_exposure="rig").is_regulated
-    apply_controls(FD, plan_controls(settings, list_controls(FD)))
-    assert camera.values[AUTO_EXPOSURE] == 1 and camera.values[EXPOSURE] == 50
-    contrast = plan_controls(V4l2Settings("/dev/x", controls=("contrast=3",)), list_controls(FD))
+def test_a_value_that_the_device_does_not_take_is_an_error(camera: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera, "_set_control", lambda control: None)
     with pytest.raises(DriverError, match="contrast: 3 was set, the device stays at 1"):
-        apply_controls(FD, contrast)
+        written(camera, controls=("contrast=3",))
     camera.failing = errno.EIO
     with pytest.raises(DriverError, match=r"contrast: the device refused 3 \(Input/output error\)"):
-        apply_controls(FD, contrast)
+        written(camera, controls=("contrast=3",))
     camera.failing = errno.ENODEV
     with pytest.raises(OSError, match="No such device"):
-        apply_controls(FD, contrast)
+        written(camera, controls=("contrast=3",))
+    for text in ("gain", "gain=high", "=3"):
+        with pytest.raises(DriverError, match="give entries such as"):
+            written(camera, controls=(text,))
 
 
-def exposure_of(controls: ExposureControls) -> CameraExposure:
-    assert controls.ranges is not None
-    return CameraExposure(controls.ranges, in_force=controls.read())
+REGULATED = V4l2Settings("/dev/omnid/lower", auto_exposure="rig")
 
 
-def test_takes_over_sets_once_when_due_and_gives_all_back(camera: FakeCamera) -> None:
-    before, controls = dict(camera.values), ExposureControls(FD)
-    exposure = exposure_of(controls)
-    controls.follow(exposure, 500)
+@pytest.fixture
+def exposure(camera: FakeCamera) -> CameraExposure:
+    ranges = exposure_ranges(FD, REGULATED)
+    assert ranges is not None
+    return CameraExposure(ranges)
+
+
+def test_a_request_is_carried_out_once_when_due_and_given_back(camera: FakeCamera, exposure: CameraExposure) -> None:
+    follow_request(FD, REGULATED, exposure, 500)
     exposure.request = ExposureRequest(ExposureSetting(8000, 10), after_ns=1000)
-    controls.follow(exposure, 999)
+    follow_request(FD, REGULATED, exposure, 999)
     assert camera.written == []
     for stamp_ns in (1000, 2000):
-        controls.follow(exposure, stamp_ns)
+        follow_request(FD, REGULATED, exposure, stamp_ns)
         assert camera.written == [(AUTO_EXPOSURE, 1), (AUTO_GAIN, 0), (EXPOSURE, 80), (GAIN, 10)]
         assert exposure.in_force == ExposureSetting(8000, 10)
-    exposure.request = ExposureRequest(ExposureSetting(4000, 5), after_ns=0)
-    controls.follow(exposure, 3000)
-    assert camera.written[4:] == [(EXPOSURE, 40), (GAIN, 5)]
-    controls.release()
-    controls.release()
-    assert camera.written[6:] == [(GAIN, 65), (AUTO_GAIN, 1), (AUTO_EXPOSURE, APERTURE_PRIORITY)]
-    assert {**camera.values, EXPOSURE: before[EXPOSURE]} == before
+    exposure.request = ExposureRequest(None, after_ns=0)
+    follow_request(FD, REGULATED, exposure, 3000)
+    assert camera.values[AUTO_EXPOSURE] == APERTURE_PRIORITY and camera.values[AUTO_GAIN] == 1
 
 
-def test_a_refusal_is_kept_and_ends_the_requests_a_lost_device_raises(camera: FakeCamera) -> None:
-    controls = ExposureControls(FD)
-    exposure = exposure_of(controls)
+def test_a_refusal_is_kept_and_ends_the_requests_a_lost_device_raises(
+    camera: FakeCamera, exposure: CameraExposure
+) -> None:
     exposure.request, camera.failing = ExposureRequest(ExposureSetting(8000, 1), after_ns=0), errno.ERANGE
-    controls.follow(exposure, 1)
-    assert exposure.problem == "it refused an exposure (Numerical result out of range)"
+    follow_request(FD, REGULATED, exposure, 1)
+    assert "refused an exposure" in exposure.problem and "result out of range" in exposure.problem
     camera.failing = 0
     exposure.request = ExposureRequest(ExposureSetting(8000, 2), after_ns=0)
-    controls.follow(exposure, 2)
+    follow_request(FD, REGULATED, exposure, 2)
     assert camera.values[GAIN] == 65
-    lost = exposure_of(ExposureControls(FD))
-    lost.request, camera.failing = exposure.request, errno.ENODEV
+    lost = CameraExposure(exposure.ranges, exposure.request)
+    camera.failing = errno.ENODEV
     with pytest.raises(OSError, match="No such device"):
-        ExposureControls(FD).follow(lost, 1)
+        follow_request(FD, REGULATED, lost, 1)
 
 
 # A V4L2 camera as a source of frames: stamps, losses, and a device that is gone for a while
@@ -332,7 +293,7 @@ MIN_BYTES = 100
 def test_frames_go_on_after_a_loss_with_all_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake, events, taken = FakeCamera(tmp_path / "video0"), list[str](), list[Frame]()
     monkeypatch.setattr(v4l2, "call", fake.call)
-    settings = V4l2Settings(str(tmp_path / "video0"), retry_s=0.05, timeout_s=0.2, controls=("contrast=7",))
+    settings = V4l2Settings(str(tmp_path / "video0"), timeout_s=0.2, controls=("contrast=7",))
     camera = V4l2Camera(settings, "lower", on_event=lambda _, text: events.append(text))
     reader = threading.Thread(target=lambda: taken.extend(camera.frames()), daemon=True)
 
@@ -356,11 +317,8 @@ def test_frames_go_on_after_a_loss_with_all_settings(tmp_path: Path, monkeypatch
     wait_until(lambda: camera.state.reopens >= 1)
     more(0, 1, 2)
     assert fake.values[0x00980901] == 7 and camera.state.status == "streaming"
-    # 2. It sends nothing, and then another camera has its number.
+    # 2. It sends nothing.
     wait_until(lambda: "no valid image for 0.2 s" in camera.state.problem)
-    fake.bus_info = b"usb-9"
-    wait_until(lambda: "use a persistent name" in camera.state.problem)
-    fake.bus_info = b"usb-1"
     reopens = camera.state.reopens
     wait_until(lambda: camera.state.reopens > reopens)
     more(0, 1, 2)
@@ -371,10 +329,27 @@ def test_frames_go_on_after_a_loss_with_all_settings(tmp_path: Path, monkeypatch
     assert [text.partition(":")[2].split(",")[0] for text in events] == [" lost", " back"] * 2
 
 
-def accepted(state: CameraState, *buffers: dict[str, int]) -> list[bool]:
-    accounting = BufferAccounting(state)
-    usual = {"flags": v4l2.TIMESTAMP_MONOTONIC, "bytesused": MIN_BYTES}
-    return [accounting.accept(v4l2.V4l2Buffer(**(usual | buffer)), MIN_BYTES) for buffer in buffers]
+class Buffers:
+    """The checks of buffers with their state and events."""
+
+    def __init__(self) -> None:
+        self.state, self.events = CameraState(), list[tuple[int, str]]()
+        self.checks = BufferChecks("lower camera", self.state, lambda *event: self.events.append(event))
+
+    def accepted(self, *buffers: dict[str, int]) -> list[bool]:
+        usual = {"flags": v4l2.TIMESTAMP_MONOTONIC, "bytesused": MIN_BYTES}
+        return [self.checks.accept(v4l2.V4l2Buffer(**(usual | buffer)), MIN_BYTES) for buffer in buffers]
+
+    def stamp(self, stamp_ns: int, arrival_ns: int, flags: int = v4l2.TIMESTAMP_MONOTONIC) -> int:
+        buffer = v4l2.V4l2Buffer(flags=flags)
+        buffer.timestamp.tv_sec, rest_ns = divmod(stamp_ns, 10**9)
+        buffer.timestamp.tv_usec = rest_ns // 1000
+        return self.checks.stamp_ns(buffer, arrival_ns)
+
+
+@pytest.fixture
+def buffers() -> Buffers:
+    return Buffers()
 
 
 @pytest.mark.parametrize(
@@ -382,71 +357,49 @@ def accepted(state: CameraState, *buffers: dict[str, int]) -> list[bool]:
     [
         ((7, 8, 10, 14), 4, 0),
         ((2**32 - 2, 1), 2, 0),  # across the overflow
-        ((3, 3 + 2**30), 2**30 - 1, 0),
         *(((100, again), 0, 1) for again in (0, 99, 100)),
     ],
 )
 def test_gaps_of_the_sequence_are_drops_and_a_restart_drops_nothing(
-    sequences: tuple[int, ...], drops: int, restarts: int
+    buffers: Buffers, sequences: tuple[int, ...], drops: int, restarts: int
 ) -> None:
-    state = CameraState()
-    accepted(state, *({"sequence": sequence} for sequence in sequences))
-    assert (state.drops, state.restarts) == (drops, restarts)
+    buffers.accepted(*({"sequence": sequence} for sequence in sequences))
+    assert (buffers.state.drops, buffers.state.restarts) == (drops, restarts)
 
 
-@pytest.mark.parametrize("broken", [{"flags": v4l2.BUFFER_ERROR}, {"bytesused": 99}, {"bytesused": 0}])
-def test_broken_buffers_are_errors_and_not_drops(broken: dict[str, int]) -> None:
-    state = CameraState()
-    assert accepted(state, {}, broken | {"sequence": 1}, {"sequence": 2}) == [True, False, True]
-    assert (state.errors, state.drops) == (1, 0)
-
-
-class Stamps:
-    """A validator with its state and its events."""
-
-    def __init__(self) -> None:
-        self.state, self.events = CameraState(), list[tuple[int, str]]()
-        self.validator = StampValidator("lower camera", self.state, lambda *event: self.events.append(event))
-
-    def validate(self, stamp_ns: int, arrival_ns: int, flags: int = v4l2.TIMESTAMP_MONOTONIC) -> int:
-        buffer = v4l2.V4l2Buffer(flags=flags)
-        buffer.timestamp.tv_sec, rest_ns = divmod(stamp_ns, 10**9)
-        buffer.timestamp.tv_usec = rest_ns // 1000
-        return self.validator.validate(buffer, arrival_ns)
-
-
-@pytest.fixture
-def stamps() -> Stamps:
-    return Stamps()
+@pytest.mark.parametrize("broken", [{"flags": v4l2.BUFFER_ERROR}, {"bytesused": 99}])
+def test_broken_buffers_are_errors_and_not_drops(buffers: Buffers, broken: dict[str, int]) -> None:
+    assert buffers.accepted({}, broken | {"sequence": 1}, {"sequence": 2}) == [True, False, True]
+    assert (buffers.state.errors, buffers.state.drops) == (1, 0)
 
 
 @pytest.mark.parametrize("flags", [0, 0x4000])
-def test_accepts_an_undeclared_clock_with_one_warning(stamps: Stamps, flags: int) -> None:
+def test_accepts_an_undeclared_clock_with_one_warning(buffers: Buffers, flags: int) -> None:
     expected = [START_NS, START_NS + PERIOD_NS]
-    assert [stamps.validate(stamp_ns, stamp_ns + DELAY_NS, flags) for stamp_ns in expected] == expected
-    assert [level for level, _ in stamps.events] == [logging.WARNING]
-    assert stamps.events[0][1].startswith("lower camera: ") and "clock" in stamps.events[0][1]
+    assert [buffers.stamp(stamp_ns, stamp_ns + DELAY_NS, flags) for stamp_ns in expected] == expected
+    assert [level for level, _ in buffers.events] == [logging.WARNING]
+    assert buffers.events[0][1].startswith("lower camera: ") and "clock" in buffers.events[0][1]
 
 
 @pytest.mark.parametrize("stamp_ns", [0, START_NS - 11 * 10**9, 1_700_000_000 * 10**9])
-def test_replaces_stamps_of_another_clock_by_the_arrival(stamps: Stamps, stamp_ns: int) -> None:
-    assert stamps.validate(stamp_ns, START_NS) == START_NS
-    assert stamps.state.restamped == 1
+def test_replaces_stamps_of_another_clock_by_the_arrival(buffers: Buffers, stamp_ns: int) -> None:
+    assert buffers.stamp(stamp_ns, START_NS) == START_NS
+    assert buffers.state.restamped == 1
 
 
-def test_stamps_increase_strictly(stamps: Stamps) -> None:
-    first = stamps.validate(START_NS, START_NS + 10)
-    earlier = stamps.validate(START_NS - 1000, START_NS + PERIOD_NS)
-    at_the_same_time = stamps.validate(START_NS, START_NS + PERIOD_NS)
+def test_stamps_increase_strictly(buffers: Buffers) -> None:
+    first = buffers.stamp(START_NS, START_NS + 10)
+    earlier = buffers.stamp(START_NS - 1000, START_NS + PERIOD_NS)
+    at_the_same_time = buffers.stamp(START_NS, START_NS + PERIOD_NS)
     replaced_ns = START_NS + PERIOD_NS - 10  # the arrival less the delay of the first
     assert (first, earlier, at_the_same_time) == (START_NS, replaced_ns, replaced_ns + 1)
-    assert stamps.state.restamped == 2
+    assert buffers.state.restamped == 2
 
 
-def test_images_of_a_clock_that_fell_back_are_dated_by_their_arrival_for_good(stamps: Stamps) -> None:
+def test_images_of_a_clock_that_fell_back_are_dated_by_their_arrival_for_good(buffers: Buffers) -> None:
     found = []
     for number in range(300):
         taken_ns = START_NS + PERIOD_NS * number
         kernel_ns = taken_ns - 3 * 10**9 * (number >= 30)
-        found.append(stamps.validate(kernel_ns, taken_ns + DELAY_NS) - taken_ns)
-    assert found == [0] * 300 and stamps.state.restamped == 270
+        found.append(buffers.stamp(kernel_ns, taken_ns + DELAY_NS) - taken_ns)
+    assert found == [0] * 300 and buffers.state.restamped == 270

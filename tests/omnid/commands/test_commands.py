@@ -88,15 +88,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
+from drivers.cameras.log_camera import LogCamera, LogImages, LogPlayback
 from omnid.config import Config
 from omnid.runs.record import record
 
 log, rig, folder = map(Path, sys.argv[1:])
 config = Config()
 config = replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=100))
-images = LogImages.load(log)
-clock = LogClock(time.monotonic_ns())
+playback = LogPlayback(LogImages.load(log), pace=3.0)
 
 class Camera(LogCamera):
     def frames(self):
@@ -105,7 +104,7 @@ class Camera(LogCamera):
             os.write(1, line.encode())  # one write, so that the lines of both threads do not mix
             yield frame
 
-cameras = {name: Camera(images, name, clock, pace=3.0) for name in ("lower", "upper")}
+cameras = {name: Camera(playback, name) for name in ("lower", "upper")}
 record(cameras, config, rig.read_text(), lambda *_: None)
 """
 

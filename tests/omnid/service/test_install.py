@@ -96,7 +96,7 @@ def test_the_examples_of_udev_are_commented_and_those_of_cameras_are_what_omnid_
     examples = [line[1:] for line in lines if line.startswith('#SUBSYSTEM=="video4linux"')]
     ports = [re.search(r'ID_PATH}=="(.*?)"', line)[1] for line in examples]  # type: ignore[index]
     devices = [
-        CaptureDevice(f"/dev/video{number}", "HD Webcam", "uvcvideo", "", "", "", port)
+        CaptureDevice(f"/dev/video{number}", "HD Webcam", f"/dev/v4l/by-path/{port}-video-index0")
         for number, port in enumerate(ports)
     ]
     assert list(udev_rules(devices)) == examples and len(examples) == 2
