@@ -11,13 +11,12 @@ from drivers.errors import DriverError
 from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
-from omnid.controller.statistics import ControllerState, TickReport, cuts_drive_short, transitions
+from omnid.controller.ipc import ControllerState, TickReport, cuts_drive_short, transitions
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerSettings
 from omnid.core.control.heading_controller import STOP, Twist
 from omnid.core.control.motion_monitor import Motion
-from omnid.core.control.safety_rules import AWAITED
-from omnid.core.control.trust import MotorReport
+from omnid.core.control.safety_rules import AWAITED, FAILED, STOPPED
 from omnid.core.nanoseconds import S_PER_NS
 
 
@@ -46,19 +45,15 @@ class Controller:
         limited: velocity [m/s] and yaw rate [rad/s] that the driver makes of a command; None: those of the command.
         """
         self._driver, self._report, self._clock_ns = driver, report, clock_ns
-        self._limited = limited or _unlimited
+        self._limited = limited or (lambda command: (command.velocity_mps, command.yaw_rate_radps))
         self._period_ns = round(period_s * 1e9)
         self._law = ControlLaw(settings, self._clock_ns())
         self._boots_until_ns = self._clock_ns() + round((boot_s or 0.0) * 1e9)
-        self._last_ns = self._due_ns = 0  # the last tick, and when the next one is due
+        self._last_ns = 0  # the last tick
+        self.due_ns = 0  # when the next one is due (CLOCK_MONOTONIC); 0: at once
         self._driven_ns = 0  # capture of the newest pose that a command has followed from
         self._motor_stopped = False  # True if the motor controller stopped by itself before the last tick
         self.state = ControllerState(failed=boot_s is not None)
-
-    @property
-    def due_ns(self) -> int:
-        """Time at which the next tick is due (CLOCK_MONOTONIC); 0: at once."""
-        return self._due_ns
 
     @property
     def is_at_rest(self) -> bool:
@@ -89,23 +84,13 @@ class Controller:
         # 1. Step the law.
         now_ns = self._clock_ns()
         dt_s, late_s = self._keep_rhythm(now_ns)
-        state = self.state
-        output = self._law.step(
-            now_ns,
-            dt_s,
-            late_s=late_s,
-            motor_awaited=state.failed and not state.sent,
-            motor_failed=state.failed,
-            motor_stopped=self._motor_stopped,
-        )
+        output = self._law.step(now_ns, dt_s, late_s=late_s, motor=self._motor_reason())
         # 2. Keep its state for the status, and report what has changed.
         self._keep_state(output.reason)
         # 3. Send its motion, and report to the law whether it was sent.
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
-        self._law.plausibility.monitor.add_command(
-            now_ns, STOP if self.state.failed else Twist(*self._limited(command))
-        )
+        self._law.plausibility.add_command(now_ns, STOP if self.state.failed else Twist(*self._limited(command)))
         if status is not None:
             self._take_status(status, now_ns)
         # 4. Report times, and the motion that the wheels have measured.
@@ -125,9 +110,9 @@ class Controller:
         """Return the seconds since the last tick, and the lateness of this one against the rhythm of the earliest."""
         dt_ns = now_ns - self._last_ns if self._last_ns else self._period_ns
         self._last_ns = now_ns
-        due_ns = min(self._due_ns or now_ns, now_ns)
+        due_ns = min(self.due_ns or now_ns, now_ns)
         missed = (now_ns - due_ns) // self._period_ns
-        self._due_ns = due_ns + (1 + missed) * self._period_ns
+        self.due_ns = due_ns + (1 + missed) * self._period_ns
         self.state.missed += missed
         return dt_ns * S_PER_NS, (now_ns - due_ns) * S_PER_NS
 
@@ -138,49 +123,46 @@ class Controller:
         state.reason = reason
         arming, commands, monitor = law.arming, law.commands, law.collision
         state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, arming.answer
-        state.needs_request, state.stop_count, state.stopped_by = (
-            arming.needs_request,
-            arming.stop_count,
-            arming.stopped_by,
-        )
-        state.refused = commands.refused
+        state.needs_request, state.refused = arming.needs_request, commands.refused
+        state.stop_count, state.stopped_by = arming.stop_count, arming.stopped_by
         state.source = "" if law.reason or commands.current is None else commands.current.source
         state.slowed_by = law.plausibility.slowed_by
-        state.measured = law.plausibility.disagreement.detail
+        state.measured = law.plausibility.conflict.detail
         state.obstacle = "" if law.reason else monitor.reason
         state.blocked = bool(state.obstacle) and monitor.holds
         if cuts_drive_short(before, state):
             state.stops[reason] += 1
         # 2. Lines for a person.
-        for line in transitions(before, state, law.plausibility.disagreement):
+        for line in transitions(before, state, law.plausibility.conflict):
             self._report(line)
+
+    def _motor_reason(self) -> str:
+        """Return what became of the last command, where that is a reason to stop."""
+        if self.state.failed:
+            return FAILED if self.state.sent else AWAITED
+        return STOPPED if self._motor_stopped else ""
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:
         """Send the command; return the motor controller's answer, None where it gave none."""
+        state = self.state
         try:
             status = self._driver.send(command)
         except LateReplyError:  # The command was most likely received, so the law continues from its motion.
-            self.state.late += 1
+            state.late += 1
             return None
         except DriverError as error:
-            self._take_problem(str(error), command.stamp_ns)
-            self.state.failed = True
-            self.state.errors += 1
+            problem = str(error)
+            if problem != state.problem:
+                self._report(problem if state.sent else f"{AWAITED}: {problem}")
+            state.failed, state.problem, state.errors = True, problem, state.errors + 1
+            state.overdue = not state.sent and command.stamp_ns > self._boots_until_ns
             self._law.motion = STOP  # its own watchdog stops a motor controller that receives nothing
             return None
-        if self.state.problem:
-            self._report("the motor controller is back" if self.state.sent else "the motor controller answers")
-        self.state.failed, self.state.problem, self.state.overdue = False, "", False
-        self.state.sent += 1
+        if state.problem:
+            self._report("the motor controller is back" if state.sent else "the motor controller answers")
+        state.failed, state.problem, state.overdue = False, "", False
+        state.sent += 1
         return status
-
-    def _take_problem(self, problem: str, now_ns: int) -> None:
-        """Keep the reason why a command failed; report it if it is new."""
-        state = self.state
-        state.overdue = not state.sent and now_ns > self._boots_until_ns
-        if problem != state.problem:
-            state.problem = problem
-            self._report(problem if state.sent else f"{AWAITED}: {problem}")
 
     def _take_status(self, status: MotorStatus, now_ns: int) -> None:
         self._motor_stopped = status.watchdog_expired
@@ -189,12 +171,11 @@ class Controller:
         self._law.contacts.update(MOTOR, ContactState(status.bumper, status.cliff))
         if status.watchdog_expired:  # the base is at rest: the command was not obeyed
             self._law.motion = STOP
-        self._law.goal.update(status.heading_rad, status.yaw_rate_radps)
+        self._law.goal.update(status.heading_rad)
         # A motor controller that holds a heading chooses the yaw rate itself, so it cannot contradict the command.
         yaw_rate_radps = math.nan if math.isfinite(status.heading_rad) else status.yaw_rate_radps
-        self._law.plausibility.add_report(
-            now_ns, MotorReport(Motion(status.velocity_mps, yaw_rate_radps), status.fault, status.battery_v)
-        )
+        motion = Motion(status.velocity_mps, yaw_rate_radps)
+        self._law.plausibility.add_report(now_ns, motion, status.fault, status.battery_v)
 
     def _to_wheel_s(self, done_ns: int) -> float:
         """Return the age of the pose's images where this command is the first that follows from them, else NaN."""
@@ -203,7 +184,3 @@ class Controller:
             return math.nan
         self._driven_ns = pose.stamp_ns
         return (done_ns - pose.stamp_ns) * S_PER_NS
-
-
-def _unlimited(command: VelocityCommand) -> tuple[float, float]:
-    return command.velocity_mps, command.yaw_rate_radps

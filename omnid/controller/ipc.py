@@ -1,20 +1,30 @@
 """The channel between the daemon and the controller process, and the messages on it.
 
 The daemon sends a ControllerStart, then ControllerUpdates. The process sends LogRecords, a StartFailed if it cannot
-start, and a TickReport (omnid.controller.statistics) for each tick.
+start, and a TickReport with its state for each tick.
 """
 
 from __future__ import annotations
 
+import math
 import pickle
 import select
 import socket
+from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
+from drivers.motion import WheelSample
+from drivers.motor import VelocityCommand
 from omnid.controller.motor import MotorSettings
+from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
+from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.contacts import NO_CONTACT, ContactState
 from omnid.core.control.control_law import ControlInput, ControllerSettings
+from omnid.core.control.motion_monitor import ADVICE, CONFLICTS, DISAGREEMENTS, MOTION_DOUBTFUL, Conflict
+from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.engine.realtime import RealtimeSettings
 
 # The wheels are ramped down when the daemon ends. Wheels that still turn after this time are stopped at once, so that
@@ -55,6 +65,87 @@ class LogRecord(NamedTuple):
     text: str
 
 
+UNTIL_ARMED: Final = "they stay stopped until cmd/arm (`omnid arm`)"
+ARMED: Final = "armed by cmd/arm"
+
+
+@dataclass(slots=True)
+class ControllerState:
+    """The state of the controller and its counts since the start."""
+
+    reason: str = IDLE  # why the wheels must stop now; empty: they may turn
+    armed: bool = False
+    disarmed_by: str = STARTED  # empty while armed
+    needs_request: bool = False  # only cmd/arm lets the wheels turn again
+    stop_count: int = 0  # stops and faults that have made cmd/arm necessary
+    stopped_by: str = ""  # reason of the newest of them, kept after arming
+    arm_answer: ArmAnswer = NO_ANSWER
+    source: str = ""  # source of the commands that drive; empty while none does
+    failed: bool = False  # the last command failed
+    problem: str = ""  # why, in words
+    overdue: bool = False  # the motor controller has not answered within its time to boot
+    fault: int = 0  # the motor controller's own number
+    battery_v: float = math.nan  # voltage that the motor controller reports
+    slowed_by: str = ""  # why the base drives slowly; empty: it need not
+    measured: str = ""  # by how much the sensors of the motion differ; empty: they agree
+    obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
+    blocked: bool = False  # the collision monitor stops the base: the command leads to an obstacle
+    sent: int = 0  # commands that were answered
+    late: int = 0  # commands whose answer did not come in time; the wheels keep turning
+    errors: int = 0  # commands that failed
+    expiries: int = 0  # how often the motor controller had stopped the wheels by itself
+    missed: int = 0  # ticks that were left out
+    refused: Counter[str] = field(default_factory=Counter)  # commands, by reason
+    stops: Counter[str] = field(default_factory=Counter)  # stops of wheels that turned, by reason
+
+
+def cuts_drive_short(before: ControllerState, after: ControllerState) -> bool:
+    """True if wheels that were allowed to turn must stop now, for another reason than a missing command."""
+    return not before.reason and after.reason not in ("", IDLE)
+
+
+def transitions(before: ControllerState, after: ControllerState, conflict: Conflict) -> Iterator[str]:
+    """Yield lines for the log that say what has changed from one tick to the next.
+
+    conflict: how images, wheels and gyro differ, where they do.
+    """
+    # 1. Arming: each time, and a refusal where its reason is another one.
+    answer, last = after.arm_answer, before.arm_answer
+    if answer != last and (not answer.refusal or answer.refusal != last.refusal):
+        yield f"arming is refused: {answer.refusal}" if answer.refusal else ARMED
+    # 2. A fault while the wheels are at rest, which ends no drive.
+    if before.armed and after.needs_request and before.reason:
+        yield f"disarmed while the wheels are stopped: {after.disarmed_by}; {UNTIL_ARMED}"
+    # 3. A reason to drive slowly that a person should examine.
+    if after.slowed_by != before.slowed_by and after.slowed_by in (MOTION_DOUBTFUL, *CONFLICTS):
+        yield f"the wheels turn slowly: {after.slowed_by}{_detail(after.slowed_by, conflict)}"
+    # 4. A stop by the collision monitor.
+    if after.blocked and not before.blocked:
+        yield f"the wheels stop: {after.obstacle}; {remedy(after.obstacle)}"
+    # 5. The end of a drive, unless it was asked for.
+    if cuts_drive_short(before, after) and after.reason != ENDS:
+        latched = f"; {UNTIL_ARMED}" if after.needs_request else ""
+        advice = f"; {ADVICE}" if after.reason in DISAGREEMENTS else ""
+        yield f"the wheels stop: {after.reason}{_detail(after.reason, conflict)}{advice}{latched}"
+
+
+def _detail(reason: str, conflict: Conflict) -> str:
+    """Return by how much images, wheels and gyro differ, where that is the reason."""
+    return f" {conflict.detail}" if conflict.reason == reason and conflict.detail else ""
+
+
+class TickReport(NamedTuple):
+    """The result of one tick."""
+
+    command: VelocityCommand | None  # command that the motor controller accepted
+    late_s: float  # delay of the tick
+    work_s: float
+    # time from the capture of a pose's images to this command, the first that follows from it; else NaN
+    to_wheel_s: float
+    state: ControllerState
+    wheels: WheelSample | None = None  # wheels as the motor controller reports them
+
+
 NO_MESSAGE: Final = object()
 _LONGEST_PACKET: Final = 1 << 16  # bytes
 
@@ -63,20 +154,16 @@ class Channel:
     """One end of a pair of sockets.
 
     Objects are pickled, so it is for two processes of one program only: neither end checks what it receives.
-    lost: messages that the other end was too slow to take.
     """
 
     def __init__(self, end: socket.socket) -> None:
         """end: one of a pair of SOCK_SEQPACKET."""
         self._end = end
-        self.lost = 0
 
     def send(self, message: object) -> None:
-        """Send one object, from any thread; drop and count it where the other end is too slow or has closed."""
-        try:
+        """Send one object, from any thread; drop it where the other end is too slow or has closed."""
+        with suppress(OSError):
             self._end.send(pickle.dumps(message), socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-        except OSError:
-            self.lost += 1
 
     def receive(self, timeout_s: float) -> Any:
         """Return the next object, NO_MESSAGE after the timeout; EOFError once the other end sends no more."""

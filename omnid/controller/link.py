@@ -17,12 +17,13 @@ from omnid.controller.ipc import (
     NO_MESSAGE,
     Channel,
     ControllerStart,
+    ControllerState,
     ControllerUpdate,
     LogRecord,
     StartFailed,
+    TickReport,
     socket_pair,
 )
-from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import S_PER_NS
@@ -107,8 +108,14 @@ class ControllerLink:
         self._ended_ns = 0  # when the process was asked to end
         here, there = socket_pair()
         self._channel = Channel(here)
-        with there:
-            self._process = _started(there.fileno())
+        with there:  # in a session of its own, which Ctrl-C does not end
+            self._process = subprocess.Popen(
+                python("-m", PROCESS, str(there.fileno())),
+                pass_fds=(there.fileno(),),
+                stdin=subprocess.DEVNULL,
+                env=python_environment(),
+                start_new_session=True,
+            )
         self._channel.send(start)
         try:
             self._await_start(START_S + start.motor.boot_s)
@@ -142,7 +149,7 @@ class ControllerLink:
         """Yield the commands that are sent from now on, until the process ends; OmnidError where it ends unasked."""
         since_ns = time.monotonic_ns()  # the process has ticked, with the wheels stopped, since before the stages began
         with suppress(EOFError):
-            while not self._overdue():
+            while not self._ended_ns or (time.monotonic_ns() - self._ended_ns) * S_PER_NS <= END_S:
                 message = self._receive(RECEIVE_S)
                 if isinstance(message, TickReport) and message.command and message.command.stamp_ns >= since_ns:
                     yield message.command
@@ -175,9 +182,6 @@ class ControllerLink:
             self._report(message.text)
         return message
 
-    def _overdue(self) -> bool:
-        return bool(self._ended_ns) and (time.monotonic_ns() - self._ended_ns) * S_PER_NS > END_S
-
     def _await_start(self, start_s: float) -> None:
         try:
             first = self._channel.receive(start_s)
@@ -202,14 +206,3 @@ class ControllerLink:
             f"the controller process has ended unexpectedly, with exit code {self._process.returncode}; the motor "
             "controller's own watchdog stops the wheels: start omnid again"
         )
-
-
-def _started(descriptor: int) -> subprocess.Popen[bytes]:
-    """Start the process in a session of its own, which Ctrl-C does not end."""
-    return subprocess.Popen(
-        python("-m", PROCESS, str(descriptor)),
-        pass_fds=(descriptor,),
-        stdin=subprocess.DEVNULL,
-        env=python_environment(),
-        start_new_session=True,
-    )

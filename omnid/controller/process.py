@@ -34,52 +34,6 @@ MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more
 ABORTING: Final = signal.SIGABRT  # systemd ends a daemon that does not respond by this, and all its processes
 
 
-class ControllerLoop:
-    """Tick in time, and receive messages in between."""
-
-    def __init__(self, channel: Channel, controller: Controller) -> None:
-        self._channel, self._controller = channel, controller
-        self._until_ns = 0  # once the daemon sends no more: when the wheels must have stopped
-
-    def run(self) -> None:
-        """Run until the daemon sends no more and the wheels are at rest."""
-        while not self._ended():
-            self._receive_until_due()
-            self._channel.send(self._controller.tick())
-
-    def _ended(self) -> bool:
-        return bool(self._until_ns) and (self._controller.is_at_rest or time.monotonic_ns() > self._until_ns)
-
-    def _receive_until_due(self) -> None:
-        """Take all messages until the tick is due, and those that wait then."""
-        overdue = 0
-        while overdue < MOST_OVERDUE:
-            left_s = (self._controller.due_ns - time.monotonic_ns()) * S_PER_NS
-            overdue += left_s <= 0
-            if self._until_ns:
-                time.sleep(max(0.0, left_s))
-                return
-            if not self._receives(left_s) and left_s <= 0:
-                return
-
-    def _receives(self, timeout_s: float) -> bool:
-        """True if a message, or the end of all messages, came within the time."""
-        try:
-            message = self._channel.receive(timeout_s)
-        except EOFError:
-            self._controller.end()
-            self._until_ns = time.monotonic_ns() + round(LONGEST_RAMP_S / S_PER_NS)
-            return True
-        if message is NO_MESSAGE:
-            return False
-        update: ControllerUpdate = message
-        self._controller.stop(update.stop_ns)
-        self._controller.touch(update.contacts)
-        if update.update is not None:
-            self._controller.take(update.update)
-        return True
-
-
 def run_controller(channel: Channel) -> int:
     """Run as the daemon's first message says; return the exit code, 2 where it cannot start."""
     with ExitStack() as closing:
@@ -99,8 +53,41 @@ def run_controller(channel: Channel) -> int:
             limited=start.motor.drive.limited,
             boot_s=None if start.waits else start.motor.boot_s,
         )
-        ControllerLoop(channel, controller).run()
+        run_until_end(channel, controller)
     return 0
+
+
+def run_until_end(channel: Channel, controller: Controller) -> None:
+    """Tick in time, and receive messages in between, until the daemon sends no more and the wheels are at rest."""
+    until_ns = 0  # once the daemon sends no more: when the wheels must have stopped
+    while not until_ns or not (controller.is_at_rest or time.monotonic_ns() > until_ns):
+        if not until_ns and not receive_until_due(channel, controller):
+            controller.end()
+            until_ns = time.monotonic_ns() + round(LONGEST_RAMP_S / S_PER_NS)
+        if until_ns:
+            time.sleep(max(0.0, (controller.due_ns - time.monotonic_ns()) * S_PER_NS))
+        channel.send(controller.tick())
+
+
+def receive_until_due(channel: Channel, controller: Controller) -> bool:
+    """Pass on all messages until the tick is due, and those that wait then; False if the daemon sends no more."""
+    overdue = 0
+    while overdue < MOST_OVERDUE:
+        left_s = (controller.due_ns - time.monotonic_ns()) * S_PER_NS
+        overdue += left_s <= 0
+        try:
+            message = channel.receive(left_s)
+        except EOFError:
+            return False
+        if message is not NO_MESSAGE:
+            update: ControllerUpdate = message
+            controller.stop(update.stop_ns)
+            controller.touch(update.contacts)
+            if update.update is not None:
+                controller.take(update.update)
+        elif left_s <= 0:
+            return True
+    return True
 
 
 def prepare_process(settings: RealtimeSettings) -> str:

@@ -18,8 +18,8 @@ from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.motion import MotionSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.controller.ipc import ARMED, ControllerState
 from omnid.controller.link import DriveLink
-from omnid.controller.statistics import ARMED, ControllerState
 from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED

@@ -10,8 +10,8 @@ from drivers.frame import Frame
 from drivers.motion import MotionSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.controller.ipc import ControllerState
 from omnid.controller.link import DriveLink
-from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.situation import WheelState
 from omnid.engine.graph import NEWEST, Graph, Output, Stream
 from omnid.formats.route_file import RouteFolder

@@ -20,7 +20,7 @@ from calib import se3
 from drivers.frame import Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.statistics import ControllerState
+from omnid.controller.ipc import ControllerState
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint

@@ -19,8 +19,8 @@ from drivers.motion import GyroSample, MotionSample
 from drivers.motor import VelocityCommand
 from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
+from omnid.controller.ipc import TickReport
 from omnid.controller.link import ControllerStatistics, DriveLink
-from omnid.controller.statistics import TickReport
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT

@@ -30,7 +30,7 @@ from drivers.motor import VelocityCommand
 from drivers.motors.simulated_motor import MotionLimits, Pose, SimulatedMotor
 from omnid.config import Config
 from omnid.controller.controller import Controller
-from omnid.controller.statistics import TickReport
+from omnid.controller.ipc import TickReport
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint

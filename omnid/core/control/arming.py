@@ -48,7 +48,6 @@ class Arming:
     - A requested stop latches in both modes. Only a request that arrived after the stop releases it, so that one that
       was sent before the stop and delayed on its way does not.
     - A bumper and a cliff sensor latch as well, and every request is refused while they report a contact.
-    - A stale command is no fault: the operator has released the stick, and may drive again at any time.
     """
 
     def __init__(self, mode: str) -> None:
@@ -102,15 +101,12 @@ class Arming:
             self.answer = ArmAnswer(request.id, self._refusal(request, fault, now_ns, longest_s))
             if not self.answer.refusal:
                 self._released_ns, self._touched = request.arrival_ns, False
-                self._arm()
+                self.armed, self.reason = True, ""
                 return request
         # 3. In the automatic mode the base is armed without a request, except after a stop or a latched contact.
         if self._automatic and not fault and not self.stop_asked and not self._touched:
-            self._arm()
+            self.armed, self.reason = True, ""
         return None
-
-    def _arm(self) -> None:
-        self.armed, self.reason = True, ""
 
     def _refusal(self, request: ArmRequest, fault: str, now_ns: int, longest_s: float) -> str:
         """Return why a request is refused, empty where it is accepted."""

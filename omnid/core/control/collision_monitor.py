@@ -11,15 +11,15 @@ Python: it runs in the process that steers.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from calib.se2 import Point, Pose2, along_arc, composed, seen_from
-from omnid.core.control.collision_geometry import TINY, DrivenWay, Outline
+from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, relative, seen_from
 from omnid.core.control.heading_controller import BRAKING_SHARE, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
@@ -77,6 +77,118 @@ class ControllerScan(NamedTuple):
     unwatched: tuple[bool, ...] = ()  # (N,) the images show nothing to rely on there; empty: they do everywhere
 
 
+# Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
+STRAIGHT_RADPS: Final = 1e-3
+TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
+INSTANT_S: Final = 1e-6  # over which a speed of approach is measured
+
+
+class Outline(NamedTuple):
+    """Rectangle about the base's origin, parallel to its axes; distances from the origin, m."""
+
+    front_m: float
+    rear_m: float
+    half_width_m: float
+
+    def grown(self, front_m: float, rear_m: float, side_m: float) -> Outline:
+        """Return the outline enlarged by margins in front, behind and on both sides [m]."""
+        return Outline(self.front_m + front_m, self.rear_m + rear_m, self.half_width_m + side_m)
+
+    def depth_m(self, x_m: float, y_m: float) -> float:
+        """Return the distance of a point from the outline; inside, that to the nearest edge, negative."""
+        dx, dy = max(x_m - self.front_m, -self.rear_m - x_m), abs(y_m) - self.half_width_m
+        return max(dx, dy) if max(dx, dy) <= 0.0 else math.hypot(max(dx, 0.0), max(dy, 0.0))
+
+    @property
+    def radius_m(self) -> float:
+        """Distance of the farthest corner from the origin."""
+        return math.hypot(max(self.front_m, self.rear_m), self.half_width_m)
+
+    def edge_m(self, c: float, s: float) -> float:
+        """Return the distance of the edge from the origin in a direction, given by its cosine and sine."""
+        along_m = (self.front_m if c > 0 else self.rear_m) / max(abs(c), TINY)
+        return min(along_m, self.half_width_m / max(abs(s), TINY))
+
+    def approach_mps(self, x_m: float, y_m: float, motion: Twist) -> float:
+        """Return the speed at which a motion takes the outline nearer to a point, or a point inside it deeper."""
+        vx, vy = motion.yaw_rate_radps * y_m - motion.velocity_mps, -motion.yaw_rate_radps * x_m
+        return (self.depth_m(x_m, y_m) - self.depth_m(x_m + vx * INSTANT_S, y_m + vy * INSTANT_S)) / INSTANT_S
+
+    def contact_s(self, motion: Twist, points: Iterable[Point]) -> float:
+        """Return the time until the outline first touches one of the points outside it, inf if it never does."""
+        v, w = motion.velocity_mps, motion.yaw_rate_radps
+        if abs(w) < STRAIGHT_RADPS:
+            edge_m, side = (self.front_m, 1.0) if v > 0.0 else (self.rear_m, -1.0)
+            ways_m = (side * x - edge_m for x, y in points if v and abs(y) <= self.half_width_m)
+            return min((way_m for way_m in ways_m if way_m >= 0.0), default=math.inf) / max(abs(v), TINY)
+        # 1. The edges lie in a ring about the centre, and so does what they can touch: most points are left out.
+        radius_m, longest_m = v / w, max(self.front_m, self.rear_m)
+        beside_m = self.half_width_m - abs(radius_m)
+        nearest_m = min(self.front_m, self.rear_m, beside_m) if beside_m > 0.0 else -beside_m
+        farthest2 = longest_m**2 + (self.half_width_m + abs(radius_m)) ** 2
+        # 2. The angle to the first crossing of a point's circle about (0, radius_m) with an edge.
+        first_rad = math.inf
+        for x_m, y_m in points:
+            rho2 = x_m**2 + (y_m - radius_m) ** 2
+            if nearest_m**2 <= rho2 <= farthest2:
+                start_rad = math.atan2(y_m - radius_m, x_m)
+                for x, y in self._crossings(radius_m, rho2):
+                    turned_rad = (start_rad - math.atan2(y - radius_m, x)) * math.copysign(1.0, w)
+                    first_rad = min(first_rad, turned_rad % math.tau)
+        return first_rad / abs(w)
+
+    def _crossings(self, radius_m: float, rho2: float) -> Iterator[Point]:
+        """Yield the points where a circle about (0, radius_m) crosses the edges."""
+        for x in (self.front_m, -self.rear_m):
+            rise = math.sqrt(max(rho2 - x * x, 0.0))
+            yield from (
+                (x, y) for y in (radius_m + rise, radius_m - rise) if rho2 >= x * x and abs(y) <= self.half_width_m
+            )
+        for y in (self.half_width_m, -self.half_width_m):
+            across2 = rho2 - (y - radius_m) ** 2
+            reach = math.sqrt(max(across2, 0.0))
+            yield from ((x, y) for x in (reach, -reach) if across2 >= 0.0 and -self.rear_m <= x <= self.front_m)
+
+    def driven_over(self, points: list[Point], pose: Pose2, side: float) -> bool:
+        """True if a base that has come to this pose drove over a point that was ahead of its leading edge.
+
+        Such a point is inside the outline or behind it, where a motion straight on does not take it nearer. side: 1.0
+        where the front leads, else -1.0.
+        """
+        edge_m, way_m = self.front_m if side > 0.0 else self.rear_m, math.hypot(pose.x_m, pose.y_m)
+        reach2 = (edge_m + self.half_width_m + 2 * way_m) ** 2  # what is farther away was not driven over
+        ahead = [(x, y) for x, y in points if side * x >= edge_m - TINY and x * x + y * y <= reach2]
+        now = seen_from(pose, ahead)
+        return any(edge_m - way_m <= side * x < edge_m and abs(y) <= self.half_width_m for x, y in now)
+
+
+class DrivenWay:
+    """Where the base was at the newest ticks, from each of which on it followed a motion."""
+
+    def __init__(self, longest_s: float) -> None:
+        """longest_s: time that is remembered."""
+        self._longest_ns = longest_s / S_PER_NS
+        self._ticks: deque[tuple[int, Twist, Pose2]] = deque()
+
+    def add(self, now_ns: int, motion: Twist) -> None:
+        """Take the motion that the base follows from now on."""
+        self._ticks.append((now_ns, motion, self._at(now_ns)))
+        while len(self._ticks) > 1 and self._ticks[1][0] < now_ns - self._longest_ns:
+            self._ticks.popleft()
+
+    def since(self, stamp_ns: int, now_ns: int) -> Pose2:
+        """Return the pose of the base now, in its own frame at a stamp."""
+        return relative(self._at(min(stamp_ns, now_ns)), self._at(now_ns))
+
+    def _at(self, stamp_ns: int) -> Pose2:
+        """Return the pose at a time, where it stood before the first motion."""
+        if not self._ticks:
+            return IDENTITY
+        at_ns, motion, pose = next((tick for tick in reversed(self._ticks) if tick[0] <= stamp_ns), self._ticks[0])
+        passed_s = max(stamp_ns - at_ns, 0) * S_PER_NS
+        return composed(pose, along_arc(motion.velocity_mps, motion.yaw_rate_radps, passed_s))
+
+
 # Floor that is seen so far is open; a scan may end nearer than that, and nothing is known beyond.
 FAR_M: Final = 5.0
 UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
@@ -124,7 +236,6 @@ MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; 
 # Speed of a person who walks towards the base, and the time until it brakes, because two pairs at 10 Hz show the
 # person, and images and commands are 0.2 s on their way.
 WALK_MPS, TURN_S = 1.6, 0.4
-MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded.
 
 BLOCKED: Final = "an obstacle is in the way"
 NEAR: Final = "an obstacle is near"
@@ -133,9 +244,17 @@ UNKNOWN: Final = "the way ahead is unknown"
 UNWATCHED: Final = "the images of the way ahead are frozen, dark or dirty"
 UNSEEN: Final = "the images show nothing: they are frozen, dark or dirty"
 SCAN_STALE: Final = "no new obstacle scan"
-REMEDY: Final = "drive back or turn away, or clear the way"
-SCAN_REMEDY: Final = "check the cameras and the load; see controller.collision.stale_s"
 IMAGES_REMEDY: Final = "check light, mirrors and cameras, which the status names"
+_REMEDIES: Final = {
+    SCAN_STALE: "check the cameras and the load; see controller.collision.stale_s",
+    UNWATCHED: IMAGES_REMEDY,
+    UNSEEN: IMAGES_REMEDY,
+}
+
+
+def remedy(reason: str) -> str:
+    """Return what to do about a reason to slow down or stop."""
+    return _REMEDIES.get(reason, "drive back or turn away, or clear the way")
 
 
 class Allowance(NamedTuple):
@@ -146,11 +265,6 @@ class Allowance(NamedTuple):
 
 
 FREE: Final = Allowance(1.0, "")
-
-
-def remedy(reason: str) -> str:
-    """Return what to do about a reason to slow down or stop."""
-    return {SCAN_STALE: SCAN_REMEDY, UNWATCHED: IMAGES_REMEDY, UNSEEN: IMAGES_REMEDY}.get(reason, REMEDY)
 
 
 class Kind(NamedTuple):
@@ -177,7 +291,7 @@ class CollisionMonitor:
         self._kinds: tuple[Kind, ...] = ()  # what the newest scan shows
         self._is_blind = False  # its images show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
-        self._way = DrivenWay()
+        self._way = DrivenWay(settings.stale_s)
         self.reason = ""  # why the last step changed the motion
         self.holds = False  # the motion was stopped, or could only creep
         self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
@@ -187,7 +301,7 @@ class CollisionMonitor:
         """Replace the scan, unless it is older."""
         if (self._stamp_ns is not None and scan.stamp_ns < self._stamp_ns) or not scan.ranges_m:
             return
-        self._stamp_ns, self._moving = scan.stamp_ns, scan.moving[:MOST_MOVING]
+        self._stamp_ns, self._moving = scan.stamp_ns, scan.moving
         settings, count = self._settings, len(scan.ranges_m)
         unwatched = scan.unwatched if len(scan.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
@@ -240,7 +354,7 @@ class CollisionMonitor:
             return FREE
         # 1. Without a recent scan nothing is known.
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
-        if not abs(age_s) <= settings.stale_s or not self._way.reaches_back_to(self._stamp_ns or 0):
+        if not abs(age_s) <= settings.stale_s:
             return Allowance(0.0, SCAN_STALE)
         if self._is_blind:
             return Allowance(0.0, UNSEEN)
@@ -250,9 +364,9 @@ class CollisionMonitor:
             over = is_driving and kind.policy == STOP
             if over and self._outline.driven_over(kind.points, moved, math.copysign(1.0, motion.velocity_mps)):
                 return Allowance(0.0, kind.reason)
-        # 3. The way before each kind, and before what moves.
-        way_m, speed_mps = abs(motion.velocity_mps) * settings.time_s, abs(motion.velocity_mps)
-        way_m = max(way_m, speed_mps**2 / (2 * self._deceleration))
+        # 3. The way before each kind, and before what moves; what is out of reach is left out.
+        speed_mps = abs(motion.velocity_mps)
+        way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * self._deceleration))
         near_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
         reach2 = (way_m + near_m + self._outline.radius_m) ** 2
         allowances = [FREE]
@@ -290,7 +404,7 @@ class CollisionMonitor:
             # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
             # would keep the base from turning away.
             stop = self._stop_polygon(motion)
-            points = [point for point in points if stop.gap_m(*point) > 0.0]
+            points = [point for point in points if stop.depth_m(*point) > 0.0]
             speed_mps = abs(motion.yaw_rate_radps) * outline.radius_m
         least = 0.0 if kind.policy == STOP else min(1.0, settings.slow_mps / speed_mps)
         share = max(self._share_before(points, motion, ALONG_SLOPE), least)
@@ -304,7 +418,7 @@ class CollisionMonitor:
         speed_mps = abs(motion.velocity_mps)
         stop, outside, least_mps = self._stop_polygon(motion), [], max(slope * speed_mps, TINY)
         for point in points:
-            if stop.gap_m(*point) > 0.0:
+            if stop.depth_m(*point) > 0.0:
                 outside.append(point)
             elif self._outline.approach_mps(*point, motion) > least_mps:
                 return 0.0
@@ -336,21 +450,21 @@ class CollisionMonitor:
         allowance = FREE
         for step in range(round(MOVING_S / MOVING_STEP_S)):
             ahead_s = step * MOVING_STEP_S
-            pose = composed(moved, along_arc(motion.velocity_mps, motion.yaw_rate_radps, ahead_s))
             at_s = age_s + ahead_s
-            [(x, y)] = seen_from(pose, [(one.x_m + one.vx_mps * at_s, one.y_m + one.vy_mps * at_s)])
+            place = (one.x_m + one.vx_mps * at_s, one.y_m + one.vy_mps * at_s)
+            pose = composed(moved, along_arc(motion.velocity_mps, motion.yaw_rate_radps, ahead_s))
+            [(x, y)] = seen_from(pose, [place])
             if step == 0:
-                limit_mps = self._deceleration * ((self._outline.gap_m(x, y) - one.radius_m) / WALK_MPS - TURN_S)
+                gap_m = max(self._outline.depth_m(x, y), 0.0) - one.radius_m
+                limit_mps = self._deceleration * (gap_m / WALK_MPS - TURN_S)
                 if speed_mps > max(limit_mps, 0.0) and side * x > -self._outline.rear_m:
-                    later_s = at_s + MOVING_STEP_S
-                    there = (one.x_m + one.vx_mps * later_s, one.y_m + one.vy_mps * later_s)
-                    [(later_x, later_y)] = seen_from(moved, [there])
-                    leaves_mps = (math.hypot(later_x, later_y) - math.hypot(x, y)) / MOVING_STEP_S
+                    dx, dy = place[0] - moved.x_m, place[1] - moved.y_m
+                    leaves_mps = (dx * one.vx_mps + dy * one.vy_mps) / max(math.hypot(dx, dy), TINY)
                     least_mps = settings.slow_mps if leaves_mps > one.sigma_mps else 0.0
                     allowance = self._capped(motion, max(least_mps, limit_mps), MOVING)
                 if self._outline.approach_mps(x, y, motion) <= TINY:
                     continue
-            gap_m = stop.gap_m(x, y) - one.radius_m
+            gap_m = max(stop.depth_m(x, y), 0.0) - one.radius_m
             if gap_m <= 0.0:
                 share = 0.0 if ahead_s <= MOVING_STOP_S else ahead_s / MOVING_S
                 return min(allowance, Allowance(share, MOVING))

@@ -14,7 +14,6 @@ from omnid.errors import OmnidError
 
 OPERATOR: Final = "operator"
 PLANNER: Final = "planner"
-MOST_SOURCES: Final = 8  # Most sources, so that the table is bounded.
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
 # Topics below cmd/.
 _RESERVED: Final = ("twist", "heading", "stop", "arm", "bumper", "cliff", "goal", "path", "navigation", "route")
@@ -42,17 +41,13 @@ class SourceSettings:
     ] = 0.5
 
     def __post_init__(self) -> None:
-        """Raise OmnidError for names that cannot be part of a topic, occur twice, or are too many."""
-        if not 1 <= len(self.names) <= MOST_SOURCES or len(set(self.names)) < len(self.names):
+        """Raise OmnidError for names that cannot be part of a topic or are one already, and for one given twice."""
+        usable = {name for name in self.names if _NAME.fullmatch(name) and name not in _RESERVED}
+        if not 0 < len(usable) == len(self.names):
             raise OmnidError(
-                f"controller.sources.names has {len(self.names)} names; give 1 to {MOST_SOURCES}, each once"
+                f"controller.sources.names has {list(self.names)}; give one or more of small letters, digits and '_', "
+                f"each once, none of {', '.join(_RESERVED)}"
             )
-        for name in self.names:
-            if not _NAME.fullmatch(name) or name in _RESERVED:
-                raise OmnidError(
-                    f"controller.sources.names has {name!r}; use small letters, digits and '_', a letter "
-                    f"first, at most 32, and none of {', '.join(_RESERVED)}"
-                )
 
 
 class TimedSetpoint(NamedTuple):
@@ -100,10 +95,7 @@ class CommandSelector:
         if command.source == current.source:
             if command.sender == current.sender:
                 return ""
-            self.conflict = (
-                f"two programs send commands as {command.source!r}: {current.sender or 'without a name'} "
-                f"drives, those of {command.sender or 'one without a name'} are refused"
-            )
+            self.conflict = f"two programs send commands as {command.source!r}: those of {command.sender!r} are refused"
             return OTHER_SENDER
         higher = self._priorities[command.source] < self._priorities[current.source]
         return "" if higher else LOWER_PRIORITY

@@ -38,17 +38,13 @@ class Contacts:
 
     def update(self, origin: str, state: ContactState) -> None:
         """Replace the state of an origin."""
-        before = self._states.get(origin, NO_CONTACT)
-        self._states[origin] = state
-        if state.bumper_count > before.bumper_count:
-            self._begun.add(BUMPER)
-        if state.cliff_count > before.cliff_count:
-            self._begun.add(CLIFF)
+        before, self._states[origin] = self._states.get(origin, NO_CONTACT), state
+        begun = {BUMPER: state.bumper_count > before.bumper_count, CLIFF: state.cliff_count > before.cliff_count}
+        self._begun |= {contact for contact, has_begun in begun.items() if has_begun}
 
-    def take(self) -> str:
-        """Return the contact that holds, or has begun since the last call; a cliff first, empty without one."""
-        begun, self._begun = self._begun, set()
-        states = self._states.values()
-        if CLIFF in begun or any(state.cliff for state in states):
-            return CLIFF
-        return BUMPER if BUMPER in begun or any(state.bumper for state in states) else ""
+    def take(self) -> set[str]:
+        """Return the contacts that hold, or have begun since the last call."""
+        found, self._begun = self._begun, set()
+        for state in self._states.values():
+            found |= {contact for contact, holds in ((BUMPER, state.bumper), (CLIFF, state.cliff)) if holds}
+        return found

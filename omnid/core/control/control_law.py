@@ -12,6 +12,7 @@ from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 from msgspec import Meta
 
+from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest
 from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
@@ -26,10 +27,10 @@ from omnid.core.control.heading_controller import (
     towards,
     wrap_angle,
 )
-from omnid.core.control.motion_monitor import AGREE, Conflict, Motion, MotionSettings
-from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
-from omnid.core.control.trust import Plausibility, TrustSettings
+from omnid.core.control.motion_monitor import AGREE, Conflict, Motion, MotionSettings, Plausibility, TrustSettings
+from omnid.core.control.safety_rules import FAULTS, Deadlines, stop_reason
 from omnid.core.nanoseconds import S_PER_NS
+from omnid.tracking_state import TrackingState
 
 TO_STAND: Final = Setpoint(0.0)
 # Change of the heading beyond what the base can turn, from which odometry was corrected or is wrong. By judgement, far
@@ -144,7 +145,7 @@ class ControlLaw:
         limits = settings.limits
         self.collision = CollisionMonitor(settings.collision, limits.deceleration_mps2, limits.yaw_acceleration_radps2)
         self.motion = STOP  # motion of the base now, from which the next step continues
-        self.reason = IDLE  # reason of the last step
+        self.reason = safety_rules.IDLE  # reason of the last step
 
     def take(self, given: ControlInput) -> None:
         """Take a pose, an obstacle scan, a setpoint, or a request to arm, which the next step answers."""
@@ -159,39 +160,38 @@ class ControlLaw:
         else:
             self.arming.request(given)
 
-    def step(
-        self,
-        now_ns: int,
-        dt_s: float,
-        *,
-        late_s: float = 0.0,
-        motor_awaited: bool = False,
-        motor_failed: bool = False,
-        motor_stopped: bool = False,
-    ) -> ControlOutput:
-        """Return the motion that the base is to follow from now on; the previous one was commanded dt_s ago."""
+    def step(self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor: str = "") -> ControlOutput:
+        """Return the motion that the base is to follow from now on; the previous one was commanded dt_s ago.
+
+        late_s: lateness of this tick. motor: AWAITED, FAILED or STOPPED where that became of the last command.
+        """
         # 1. Faults, from deadlines and from motion that does not fit together, disarm; requests to arm are answered.
-        pose, command = self.pose, self.commands.current
-        faults = SafetyInputs(
-            pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * S_PER_NS,
-            pose_state="" if pose is None else pose.state,
-            command_age_s=math.inf,
-            late_s=late_s,
-            pose_jumped=self._pose_jumped,
-            motor_awaited=motor_awaited,
-            motor_failed=motor_failed,
-            motor_stopped=motor_stopped,
-            contact=self.contacts.take(),
-            ending=self.ending,
-        )
-        inputs, deadlines = self.plausibility.added_to(faults), self._settings.deadlines
-        accepted = self.arming.step(stop_reason(inputs, deadlines, FAULTS), now_ns, deadlines.command_s)
+        pose, command, deadlines = self.pose, self.commands.current, self._settings.deadlines
+        pose_age_s = math.inf if pose is None else (now_ns - pose.stamp_ns) * S_PER_NS
+        # A pose or a setpoint from the future by more than the deadline is a reason as well, and so is a NaN.
+        conditions = {
+            motor: True,
+            safety_rules.OVERLOADED: not late_s <= deadlines.tick_s,
+            safety_rules.NO_POSE: pose is None,
+            safety_rules.POSE_STALE: pose is not None and not abs(pose_age_s) <= deadlines.pose_s,
+            safety_rules.POSE_LOST: pose is not None and pose.state == TrackingState.LOST,
+        }
+        faults = {reason for reason, holds in conditions.items() if holds}
+        faults |= self.contacts.take() | self.plausibility.take()
+        accepted = self.arming.step(stop_reason(faults, FAULTS), now_ns, deadlines.command_s)
         if accepted is not None:
             self._void_ns = max(self._void_ns, accepted.arrival_ns)
         # 2. The reason to stop, of all rules; it voids the setpoints that have arrived so far.
-        stopped, armed, age_s = self.arming.stop_asked, self.arming.armed, self._command_age_s(now_ns)
-        inputs = replace(inputs, stop_asked=stopped, armed=armed, command_age_s=age_s)
-        self.reason = stop_reason(inputs, deadlines)
+        age_s = self._command_age_s(now_ns)
+        conditions = {
+            safety_rules.ENDS: self.ending,
+            safety_rules.ASKED: self.arming.stop_asked,
+            safety_rules.POSE_JUMPED: self._pose_jumped,
+            safety_rules.NOT_ARMED: not self.arming.armed,
+            safety_rules.IDLE: age_s == math.inf,
+            safety_rules.COMMAND_STALE: not abs(age_s) <= deadlines.command_s,
+        }
+        self.reason = stop_reason(faults | {reason for reason, holds in conditions.items() if holds})
         self._pose_jumped = False
         if self.reason:
             self._void_ns = now_ns

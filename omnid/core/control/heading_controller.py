@@ -18,8 +18,6 @@ HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would chang
 BRAKING_SHARE: Final = 0.8
 # Between the heading that a motor controller reported and its turn to the next goal; by trial with simulated ones.
 REACTION_S: Final = 0.15
-# Times the yaw rate's limit, reported: the goal is the present heading until it is slower.
-OVERSPEED: Final = 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,16 +112,6 @@ def towards(setpoint: Setpoint, heading_rad: float, last: Twist, limits: Velocit
     return limits.within(Twist(setpoint.velocity_mps, math.copysign(min(GAIN_HZ * size_rad, braking_radps), side)))
 
 
-def longest_lead_rad(limits: VelocityLimits) -> float:
-    """Return the limit of the lead of the goal over the heading.
-
-    It is the angle that the base turns at the highest rate within the reaction time, and then until it has braked. A
-    motor controller turns the faster, the larger the lead is, by a gain that is not known here.
-    """
-    rate_radps = limits.yaw_rate_radps
-    return min(math.pi / 2, rate_radps * REACTION_S + rate_radps**2 / (2 * limits.yaw_acceleration_radps2))
-
-
 class HeadingGoal:
     """The goal for a motor controller that holds a heading by itself, in its own count of headings.
 
@@ -133,16 +121,18 @@ class HeadingGoal:
     """
 
     def __init__(self, limits: VelocityLimits) -> None:
-        self._longest_rad = longest_lead_rad(limits)
-        self._highest_radps = OVERSPEED * limits.yaw_rate_radps
+        # The lead over the heading is at most the angle that the base turns at the highest rate within the reaction
+        # time, and then until it has braked: a motor controller turns the faster, the larger the lead is.
+        rate_radps = limits.yaw_rate_radps
+        turned_rad = rate_radps * REACTION_S + rate_radps**2 / (2 * limits.yaw_acceleration_radps2)
+        self._longest_rad = min(math.pi / 2, turned_rad)
         self._goal_rad: float | None = None  # goal of the last tick, while the base turns or drives
-        self._counted_rad = self._rate_radps = 0.0  # values of the last report
+        self._counted_rad = 0.0  # in the last report
 
-    def update(self, counted_rad: float, rate_radps: float) -> None:
-        """Take the heading and the yaw rate that the motor controller reported; NaN where it knows none."""
+    def update(self, counted_rad: float) -> None:
+        """Take the heading that the motor controller reported; NaN where it knows none."""
         if math.isfinite(counted_rad):
             self._counted_rad = counted_rad
-        self._rate_radps = rate_radps if math.isfinite(rate_radps) else 0.0
 
     def towards(self, turn_rad: float, error_rad: float | None = None) -> float:
         """Return the goal after a turn since the last call; the present heading where a number is not finite.
@@ -155,8 +145,6 @@ class HeadingGoal:
         lead_rad = clamp(wrap_angle(before_rad + turn_rad - self._counted_rad), self._longest_rad)
         if error_rad is not None and abs(error_rad) < self._longest_rad:
             lead_rad = min(max(lead_rad, min(error_rad, 0.0)), max(error_rad, 0.0))
-        if abs(self._rate_radps) > self._highest_radps and self._rate_radps * lead_rad > 0:
-            lead_rad = 0.0
         self._goal_rad = wrap_angle(self._counted_rad + lead_rad)
         return self._goal_rad
 

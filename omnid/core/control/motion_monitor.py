@@ -1,9 +1,9 @@
-"""Comparison of the motion that is commanded, reported by the wheels, and seen by the cameras.
+"""Trust in pose and motor: uncertainty, resets, faults, battery, and motion that does not fit together.
 
-The three differ by plausible slip, delay and noise. A speed that was seen or reported is plausible if it lies between
-the lowest and the highest expected speed of the last delay_s, widened by the slip, the tolerance and three standard
-deviations. What lies beyond, integrated over time, is the unexplained motion in m and rad: some of it slows the base
-down, more stops it. While nothing is unexplained, the sum falls again.
+Commanded, reported and seen motion differ by plausible slip, delay and noise. A speed that was seen or reported is
+plausible if it lies between the lowest and the highest expected speed of the last delay_s, widened by the slip, the
+tolerance and three standard deviations. What lies beyond, integrated over time, is the unexplained motion in m and rad:
+some of it slows the base down, more stops it. While nothing is unexplained, the sum falls again.
 
     commanded 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.02 = 0.16 m/s: 0.16 m a second
 
@@ -15,14 +15,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import takewhile
-from typing import Annotated, Final, NamedTuple, TypeAlias
+from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 from msgspec import Meta
 
-from omnid.core.control.heading_controller import LONGEST_TICK_S, STOP, Twist
+from omnid.core.control.heading_controller import LONGEST_TICK_S, STOP, Twist, VelocityLimits
 from omnid.core.nanoseconds import S_PER_NS
+from omnid.tracking_state import TrackingState
 
 MAX_MOTIONS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
 SIGMAS: Final = 3.0  # Noise exceeds this in 0.3 % of the samples, so that false alarms are rare.
@@ -32,6 +33,15 @@ RECOVERY: Final = 0.5
 # After this time at rest by command, all unexplained motion is forgotten; by trial on development seeds.
 REST_S: Final = 2.0
 
+# A voltage may be low for this time while a motor starts; by trial on development seeds.
+BATTERY_S: Final = 2.0
+POSE_DEGRADED: Final = "the pose is degraded"
+MOTION_DOUBTFUL: Final = "the motion that is seen or reported is not the commanded one"
+
+POSE_RESET: Final = "odometry has lost its map and begun again"
+POSE_UNSURE: Final = "the pose is too uncertain"
+MOTOR_FAULT: Final = "the motor controller reports a fault"
+BATTERY_EMPTY: Final = "the battery is empty"
 NOT_SEEN: Final = "the images do not show the commanded motion"
 NOT_COMMANDED: Final = "the images show a motion that was not commanded"
 NOT_FOLLOWED: Final = "the wheels do not follow the commands"
@@ -103,26 +113,49 @@ class Motion(NamedTuple):
     yaw_rate_sigma_radps: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class TrustSettings:
+    """Levels at which the base slows down or stops."""
+
+    degraded_speed: float = 0.5  # share of the speeds while the pose is degraded or some motion is unexplained
+    velocity_sigma_mps: Annotated[
+        float,
+        Meta(ge=0, le=10),
+        "the wheels stop when the standard deviation of the seen velocity stays higher, m/s; 0: never",
+    ] = 0.2
+    yaw_rate_sigma_radps: Annotated[float, Meta(ge=0, le=20), "the same of the yaw rate, rad/s; 0: never"] = 0.4
+    sigma_s: float = 0.3  # time for which a standard deviation may be higher, s
+    odometry_reset: Annotated[Literal["stop", "ignore"], "when odometry has lost its map and begins again"] = "stop"
+    battery_v: Annotated[
+        float, Meta(ge=0, le=1000), "the wheels stop when the battery's voltage stays below, V; 0: never"
+    ] = 0.0
+
+
 # Time [ns], velocity [m/s] and yaw rate [rad/s] of a motion that was commanded or reported.
 _TimedMotion: TypeAlias = tuple[int, float, float]
 
 
-class MotionMonitor:
-    """Sums of unexplained motion; the caller gives each tick's command, each pose and each report of the wheels.
+class Plausibility:
+    """Judges poses, commands and reports of the motor controller: what stops the base, and what slows it down.
 
-    The memory of commands is bounded. Not thread-safe.
+    The caller gives each tick's command, each pose and each report. The memory of motions is bounded. Not thread-safe.
     """
 
-    def __init__(self, settings: MotionSettings) -> None:
-        self._settings = settings
+    def __init__(self, trust: TrustSettings, motion: MotionSettings) -> None:
+        self._trust, self._settings = trust, motion
         self._commanded: deque[_TimedMotion] = deque(maxlen=MAX_MOTIONS)
         self._reported: deque[_TimedMotion] = deque(maxlen=MAX_MOTIONS)
         self._driven_ns: int | None = None  # the newest tick with a commanded motion
         self._last_seen_ns = self._last_report_ns = 0
         self._wheels_report = False  # whether the wheels have reported a motion: some controllers never do
         self._unexplained = {reason: [0.0, 0.0] for reason in COMPARED}  # m, rad
-        self.reason = ""  # the disagreement for which the base must stop, until it has stood for REST_S
-        self.detail = ""  # the motions that disagree
+        # Since when the velocity has been too uncertain, and the battery low, by the stamps of the samples; the newest.
+        self._unsure_ns: tuple[int, int] | None = None
+        self._low_ns: tuple[int, int] | None = None
+        self._resets: int | None = None
+        self._is_degraded = self._is_reset = self._is_faulty = False
+        self.reason = ""  # the unexplained motion for which the base must stop, until it has stood for REST_S
+        self.conflict = AGREE  # conflict of the newest pose
 
     @property
     def is_doubtful(self) -> bool:
@@ -132,6 +165,32 @@ class MotionMonitor:
             for metres, radians in self._unexplained.values()
         )
 
+    @property
+    def slowed_by(self) -> str:
+        """The reason to drive slowly; empty without one."""
+        if self._is_degraded:
+            return POSE_DEGRADED
+        return MOTION_DOUBTFUL if self.is_doubtful else self.conflict.reason
+
+    def slowed(self, wanted: Twist, limits: VelocityLimits) -> Twist:
+        """Return the wanted motion within the limits, which are lower where there is a reason to drive slowly."""
+        share = self._trust.degraded_speed if self.slowed_by else 1.0
+        top_mps, top_radps = share * limits.velocity_mps, share * limits.yaw_rate_radps
+        return replace(limits, velocity_mps=top_mps, yaw_rate_radps=top_radps).within(wanted)
+
+    def take(self) -> set[str]:
+        """Return the reasons to stop; a reset of odometry counts for one step."""
+        conditions = {
+            POSE_RESET: self._is_reset,
+            POSE_UNSURE: _seconds(self._unsure_ns) >= self._trust.sigma_s,
+            MOTOR_FAULT: self._is_faulty,
+            BATTERY_EMPTY: _seconds(self._low_ns) >= BATTERY_S,
+            self.reason: True,
+            self.conflict.reason: self.conflict.is_fault,
+        }
+        self._is_reset = False
+        return {reason for reason, holds in conditions.items() if holds}
+
     def add_command(self, now_ns: int, motion: Twist) -> None:
         """Add the motion that was commanded at this tick."""
         if not self._settings.check:
@@ -140,30 +199,44 @@ class MotionMonitor:
         if motion != STOP:
             self._driven_ns = now_ns
         if self._driven_ns is None or (now_ns - self._driven_ns) * S_PER_NS > REST_S:
-            self._forget()
+            self.reason, self._unexplained = "", {reason: [0.0, 0.0] for reason in COMPARED}
 
-    def add_seen(self, stamp_ns: int, seen: Motion) -> None:
-        """Compare what the cameras saw at a time with what was commanded, or reported by the wheels, until then."""
-        before_ns, self._last_seen_ns = self._last_seen_ns, max(stamp_ns, self._last_seen_ns)
-        if stamp_ns <= before_ns or not self._drives_at(stamp_ns):
-            return
-        explained = [*self._recent(self._commanded, stamp_ns), *self._recent(self._reported, stamp_ns)]
-        self._compare(seen, explained, _passed_s(before_ns, stamp_ns), NOT_SEEN, NOT_COMMANDED)
+    def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, conflict: Conflict = AGREE) -> None:
+        """Add the next pose; resets: how often odometry has begun again. A lost pose says nothing about the motion."""
+        trust = self._trust
+        self.conflict = conflict if self._settings.check else AGREE
+        self._is_degraded = state == TrackingState.DEGRADED
+        # A NaN is uncertain; a level of 0 switches its rule off.
+        levels = (
+            (trust.velocity_sigma_mps, seen.velocity_sigma_mps),
+            (trust.yaw_rate_sigma_radps, seen.yaw_rate_sigma_radps),
+        )
+        is_unsure = any(level > 0 and not sigma <= level for level, sigma in levels)
+        self._unsure_ns = _lasting(self._unsure_ns, stamp_ns, is_unsure)
+        self._is_reset |= self._resets not in (None, resets) and trust.odometry_reset == "stop"
+        self._resets = resets
+        # What the cameras saw until then is explained by what was commanded, or reported by the wheels.
+        if state != TrackingState.LOST and stamp_ns > self._last_seen_ns:
+            before_ns, self._last_seen_ns = self._last_seen_ns, stamp_ns
+            if self._drives_at(stamp_ns):
+                explained = [*self._recent(self._commanded, stamp_ns), *self._recent(self._reported, stamp_ns)]
+                self._compare(seen, explained, _passed_s(before_ns, stamp_ns), NOT_SEEN, NOT_COMMANDED)
 
-    def add_report(self, now_ns: int, reported: Motion) -> None:
-        """Compare what the wheels report with what was commanded; a yaw rate of NaN is not compared."""
-        if not self._settings.check:
-            return
+    def add_report(self, now_ns: int, reported: Motion, fault: int, battery_v: float) -> None:
+        """Add a report of the motor controller, whose motion is compared with what was commanded.
+
+        A yaw rate of NaN is not compared; fault: 0 is none; battery_v: NaN where it is not reported.
+        """
+        self._is_faulty = fault != 0
+        self._low_ns = _lasting(self._low_ns, now_ns, battery_v < self._trust.battery_v)
         before_ns, self._last_report_ns = self._last_report_ns, now_ns
         turn_radps = reported.yaw_rate_radps if math.isfinite(reported.yaw_rate_radps) else 0.0
         self._wheels_report |= reported.velocity_mps != 0.0 or turn_radps != 0.0
-        if not self._wheels_report or not math.isfinite(reported.velocity_mps):
-            return
-        self._reported.append((now_ns, reported.velocity_mps, turn_radps))
-        if not self._drives_at(now_ns):
-            return
-        explained, dt_s = self._recent(self._commanded, now_ns), _passed_s(before_ns, now_ns)
-        self._compare(reported, explained, dt_s, NOT_FOLLOWED, NOT_FOLLOWED)
+        if self._settings.check and self._wheels_report and math.isfinite(reported.velocity_mps):
+            self._reported.append((now_ns, reported.velocity_mps, turn_radps))
+            if self._drives_at(now_ns):
+                explained, dt_s = self._recent(self._commanded, now_ns), _passed_s(before_ns, now_ns)
+                self._compare(reported, explained, dt_s, NOT_FOLLOWED, NOT_FOLLOWED)
 
     def _drives_at(self, at_ns: int) -> bool:
         """True if a motion was commanded within the delay before a time."""
@@ -197,25 +270,22 @@ class MotionMonitor:
             low, high = low - limits.slip * abs(low) - tolerance, high + limits.slip * abs(high) + tolerance
             beyond = max(0.0, value - high) - max(0.0, low - value)
             of = too_little if beyond * (low + high) < 0.0 else too_much
-            for reason in {too_little: None, too_much: None}:
+            for reason in dict.fromkeys((too_little, too_much)):
                 sums, adds = self._unexplained[reason], beyond != 0.0 and reason == of
                 sums[axis] = max(0.0, sums[axis] + dt_s * (abs(beyond) if adds else -RECOVERY * limit))
-                if sums[axis] > limit and not self.reason:
-                    what = "reported" if reason == NOT_FOLLOWED else "seen"
-                    mean = (sum(motion[part] for motion in explained) / len(explained) for part in (1, 2))
-                    moved = found.velocity_mps, found.yaw_rate_radps
-                    self.reason, self.detail = reason, f"({what} {_words(*moved)}, expected {_words(*mean)})"
-
-    def _forget(self) -> None:
-        self.reason = self.detail = ""
-        for sums in self._unexplained.values():
-            sums[:] = 0.0, 0.0
-
-
-def _words(velocity_mps: float, yaw_rate_radps: float) -> str:
-    return f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s"
+                if sums[axis] > limit:
+                    self.reason = self.reason or reason
 
 
 def _passed_s(before_ns: int, now_ns: int) -> float:
     """Return the time between two samples, at most LONGEST_TICK_S: nothing is known of a longer gap."""
     return min(max(0.0, (now_ns - before_ns) * S_PER_NS), LONGEST_TICK_S)
+
+
+def _lasting(since_ns: tuple[int, int] | None, now_ns: int, holds: bool) -> tuple[int, int] | None:
+    """Return when a condition began to hold, and now; None where it does not hold."""
+    return (now_ns if since_ns is None else since_ns[0], now_ns) if holds else None
+
+
+def _seconds(since_ns: tuple[int, int] | None) -> float:
+    return math.nan if since_ns is None else (since_ns[1] - since_ns[0]) * S_PER_NS

@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.control.collision_geometry import Outline
-from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
+from omnid.core.control.collision_monitor import CollisionSettings, Outline, unknown_ends
 from omnid.core.obstacles.grid import CELL_M, OCCUPIED, UNKNOWN, FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 

@@ -14,9 +14,8 @@ from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
-from omnid.core.control.motion_monitor import AGREE, Conflict
+from omnid.core.control.motion_monitor import AGREE, Conflict, TrustSettings
 from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.trust import TrustSettings
 from omnid.engine.telemetry import StageStats
 
 PERIOD_S = 0.05

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 from collections.abc import Callable
@@ -16,14 +15,12 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.serial_motor import LateReplyError, SerialMotor
+from drivers.motors.serial_motor import LateReplyError
 from drivers.motors.simulated_motor import MotionLimits, SimulatedBase, SimulatedMotor
 from omnid.controller.controller import Controller
 from omnid.controller.motor import MotorSettings, open_motor
-from omnid.controller.statistics import ControllerState
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
-from omnid.core.control.collision_monitor import BLOCKED, CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import (
@@ -31,11 +28,9 @@ from omnid.core.control.heading_controller import (
     VelocityLimits,
 )
 from omnid.core.control.safety_rules import POSE_JUMPED, Deadlines
-from tests.contract.simulated_controllers import PtyMotor
 from tests.omnid.controller.bench import (
     LIMITS,
     PERIOD_S,
-    SETTINGS,
     UNATTENDED,
     Bench,
 )
@@ -281,31 +276,6 @@ def test_wheels_that_are_limited_by_their_driver_follow_the_commands(known: bool
     assert (not bench.controller.state.stops and not slowed) == known
 
 
-def test_counts_commands_and_stops_before_obstacles() -> None:
-    bench = Bench(replace(SETTINGS, collision=CollisionSettings()))
-
-    def drive(ranges: tuple[float, ...], ticks: int) -> ControllerState:
-        for _ in range(ticks):
-            bench.send_pose()
-            bench.controller.take(ControllerScan(bench.now_ns, ranges))
-            bench.send_setpoint()
-            bench.tick()
-        return bench.controller.state
-
-    bench.send_pose()
-    bench.arm()
-    bench.tick()
-    free = (math.inf,) * 360
-    state = drive(free, 20)
-    assert state.sent == len(bench.wheels.commands) == 21 and not state.blocked and not state.obstacle
-    slowed = drive(tuple(0.9 if 150 <= k < 210 else math.inf for k in range(360)), 3)
-    assert slowed.obstacle and not slowed.blocked
-    for _ in range(2):
-        stopped = drive(tuple(0.38 if 150 <= k < 210 else math.inf for k in range(360)), 10)
-        assert stopped.blocked and stopped.obstacle == BLOCKED
-        assert not drive(free, 10).blocked
-
-
 # The motor of the settings: the simulation of its protocol, and settings that cannot work.
 SLOW_HZ = 1.0  # so that a machine under load has a second to answer
 
@@ -324,13 +294,6 @@ def test_simulates_a_motor_controller() -> None:
 def test_refuses_a_watchdog_of_fewer_than_four_ticks() -> None:
     with ExitStack() as closing, pytest.raises(DriverError, match="give at least 200, 4 ticks"):
         open_motor(MotorSettings(port="simulated", rate_hz=20.0, watchdog_ms=199), closing)
-
-
-def test_a_missing_answer_leaves_time_in_the_tick() -> None:
-    with ExitStack() as closing:
-        twin = closing.enter_context(contextlib.closing(PtyMotor()))
-        driver = open_motor(MotorSettings(port=twin.port, rate_hz=20.0, watchdog_ms=200), closing)
-        assert isinstance(driver, SerialMotor) and driver._timeout_s == pytest.approx(0.8 * 0.05)
 
 
 # docs/safety.md: each hazard has a test that is marked with it, and each reason to stop says whether it disarms.

@@ -36,7 +36,6 @@ from omnid.core.control.heading_controller import (
     STOP,
     Setpoint,
     Twist,
-    longest_lead_rad,
     wrap_angle,
 )
 from omnid.core.control.motion_monitor import AGREE, CONFLICTS, Conflict
@@ -47,7 +46,8 @@ PHASE = 40  # ticks with the same motor, images and calm
 MANY_TICKS = 1_000_000
 DEADLINES = SETTINGS.deadlines
 HOLD_NS = round(SETTINGS.sources.hold_s * 1e9)
-LEAD_RAD = longest_lead_rad(LIMITS)
+# The angle that it turns at the highest rate within 0.15 s, and then until it has braked.
+LEAD_RAD = LIMITS.yaw_rate_radps * 0.15 + LIMITS.yaw_rate_radps**2 / (2 * LIMITS.yaw_acceleration_radps2)
 SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", "c"), ("autopilot", "d"))
 TINY = 1e-9
 FAULTS = frozenset(rule.reason for rule in safety_rules.FAULTS)

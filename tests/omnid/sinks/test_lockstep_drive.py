@@ -21,9 +21,15 @@ from drivers.motor import VelocityCommand
 from omnid import Odometry
 from omnid.core.control.control_law import ControllerSettings, ReplaySetpoint
 from omnid.core.control.heading_controller import Twist, VelocityLimits
-from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN, Motion, MotionSettings
+from omnid.core.control.motion_monitor import (
+    NOT_COMMANDED,
+    NOT_SEEN,
+    Motion,
+    MotionSettings,
+    Plausibility,
+    TrustSettings,
+)
 from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.trust import MotorReport, Plausibility, TrustSettings
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
 from omnid.sinks.drive import LockstepDrive, controller_pose
@@ -114,11 +120,11 @@ def stops(rig: Rig, images: list[tuple[np.ndarray, np.ndarray]], commands: list[
         stamp_ns = START_NS + number * PERIOD_NS
         pose = controller_pose(odometry.process(stamp_ns, *pair), np.eye(4))
         judged.add_pose(stamp_ns, pose.state, pose.motion, pose.resets)
-        yield judged.slowed_by, judged.monitor.reason
+        yield judged.slowed_by, judged.reason
         for tick in range(TICKS):
             now_ns = stamp_ns + tick * PERIOD_NS // TICKS
-            judged.monitor.add_command(now_ns, command)
-            judged.add_report(now_ns, MotorReport(Motion(command.velocity_mps, command.yaw_rate_radps)))
+            judged.add_command(now_ns, command)
+            judged.add_report(now_ns, Motion(command.velocity_mps, command.yaw_rate_radps), 0, math.nan)
 
 
 def test_the_motion_of_a_right_rig_is_plausible(scene: Path) -> None:

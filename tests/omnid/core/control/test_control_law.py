@@ -26,15 +26,29 @@ from omnid.core.control.control_law import ControlLaw, ControllerPose, Controlle
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
     STOP,
-    HeadingGoal,
     Setpoint,
     Twist,
     VelocityLimits,
     towards,
     wrap_angle,
 )
-from omnid.core.control.motion_monitor import CONFLICTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
-from omnid.core.control.safety_rules import Deadlines, SafetyInputs, stop_reason
+from omnid.core.control.motion_monitor import NOT_SEEN
+from omnid.core.control.safety_rules import (
+    ASKED,
+    AWAITED,
+    BUMPER,
+    CLIFF,
+    COMMAND_STALE,
+    ENDS,
+    IDLE,
+    NO_POSE,
+    NOT_ARMED,
+    OVERLOADED,
+    POSE_JUMPED,
+    POSE_STALE,
+    Deadlines,
+    stop_reason,
+)
 from omnid.errors import OmnidError
 
 TICK_NS, TICK_S = 20_000_000, 0.02
@@ -104,88 +118,36 @@ def test_where_the_images_are_those_of_a_log_neither_motion_nor_obstacles_are_co
     assert settings.of_replay.arming == AUTOMATIC
 
 
-# The safety rules: every reason to stop, their order, and numbers that are not finite.
-DEADLINES = Deadlines(pose_s=0.5, command_s=0.4, tick_s=0.25)
-GOOD = SafetyInputs(pose_age_s=0.1, pose_state="tracking", command_age_s=0.1, late_s=0.01)
-CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are reported
-    safety_rules.ENDS: {"ending": True},
-    safety_rules.ASKED: {"stop_asked": True},
-    safety_rules.CLIFF: {"contact": safety_rules.CLIFF},
-    safety_rules.BUMPER: {"contact": safety_rules.BUMPER},
-    safety_rules.AWAITED: {"motor_awaited": True},
-    safety_rules.FAILED: {"motor_failed": True},
-    safety_rules.STOPPED: {"motor_stopped": True},
-    safety_rules.MOTOR_FAULT: {"motor_faulty": True},
-    safety_rules.BATTERY_EMPTY: {"battery_empty": True},
-    safety_rules.OVERLOADED: {"late_s": 0.26},
-    safety_rules.NO_POSE: {"pose_age_s": math.inf},
-    safety_rules.POSE_STALE: {"pose_age_s": 0.51},
-    safety_rules.POSE_LOST: {"pose_state": "lost"},
-    safety_rules.POSE_RESET: {"pose_reset": True},
-    safety_rules.POSE_UNSURE: {"pose_unsure": True},
-    NOT_FOLLOWED: {"disagreement": NOT_FOLLOWED},
-    NOT_SEEN: {"disagreement": NOT_SEEN},
-    NOT_COMMANDED: {"disagreement": NOT_COMMANDED},
-    **{reason: {"disagreement": reason} for reason in CONFLICTS},
-    safety_rules.POSE_JUMPED: {"pose_jumped": True},
-    safety_rules.NOT_ARMED: {"armed": False},
-    safety_rules.COMMAND_STALE: {"command_age_s": 0.41},
-}
+# The safety rules: order, deadlines, and numbers that are not finite.
 
 
-def reason_for(**changes: object) -> str:
-    return stop_reason(replace(GOOD, **changes), DEADLINES)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("state", ["tracking", "degraded"])
-def test_lets_the_wheels_turn_where_no_rule_applies(state: str) -> None:
-    assert reason_for(pose_state=state) == ""
-    assert reason_for(pose_age_s=0.5, command_age_s=0.4, late_s=0.25) == "", "a deadline itself is in time"
-
-
-def test_reports_the_first_of_two_causes() -> None:
-    for first, second in combinations(CAUSES, 2):
-        if not CAUSES[first].keys() & CAUSES[second].keys():  # one disagreement is reported at a time
-            assert reason_for(**CAUSES[first], **CAUSES[second]) == first
-
-
-def test_reports_what_was_never_there_as_missing_rather_than_stale() -> None:
-    assert reason_for(command_age_s=math.inf) == safety_rules.IDLE
-    assert reason_for(pose_age_s=math.inf, pose_state="") == safety_rules.NO_POSE
-    assert reason_for(pose_age_s=math.inf, command_age_s=math.inf) == safety_rules.NO_POSE
-
-
-@pytest.mark.parametrize("name", ["pose_age_s", "command_age_s", "late_s"])
-def test_stops_where_an_input_is_nan(name: str) -> None:
-    assert reason_for(**{name: math.nan}) != ""
-
-
-@pytest.mark.parametrize("name", ["pose_age_s", "command_age_s"])
-def test_stops_where_a_stamp_is_in_the_future(name: str) -> None:
-    """A camera with wrong stamps must not give a pose that never goes stale."""
-    assert reason_for(**{name: -0.001}) == ""
-    assert reason_for(**{name: -10.0}) != "" and reason_for(**{name: -math.inf}) != ""
-
-
-def test_the_table_has_every_reason_once() -> None:
+def test_reports_the_first_of_two_causes_and_every_fault_disarms() -> None:
     reasons = [rule.reason for rule in safety_rules.RULES]
-    assert reasons == [*list(CAUSES)[:-1], safety_rules.IDLE, safety_rules.COMMAND_STALE]
-
-
-def test_only_faults_disarm() -> None:
-    """Faults of the robot, not the wishes of its operator."""
-    kept = {
-        safety_rules.ENDS,
-        safety_rules.ASKED,
-        safety_rules.POSE_JUMPED,
-        safety_rules.NOT_ARMED,
-        safety_rules.IDLE,
-        safety_rules.COMMAND_STALE,
-    }
+    assert len(set(reasons)) == len(reasons)
+    for first, second in combinations(reasons, 2):
+        assert stop_reason({second, first}) == first and stop_reason({first, ""}) == first
+    order = (ENDS, ASKED, CLIFF, BUMPER, AWAITED, NO_POSE, POSE_STALE, NOT_SEEN, POSE_JUMPED, NOT_ARMED, COMMAND_STALE)
+    assert sorted(order, key=reasons.index) == list(order)
+    kept = {ENDS, ASKED, POSE_JUMPED, NOT_ARMED, IDLE, COMMAND_STALE}
     assert {rule.reason for rule in safety_rules.RULES if not rule.disarms} == kept
-    for reason in CAUSES.keys() - kept:
-        everything = replace(GOOD, armed=False, **CAUSES[reason])  # type: ignore[arg-type]
-        assert stop_reason(everything, DEADLINES, safety_rules.FAULTS) == reason
+
+
+def reason_for(pose_age_s: float = 0.1, command_age_s: float = 0.1, late_s: float = 0.0) -> str:
+    """Return the reason to stop of a law that arms itself, for a pose and a command of these ages."""
+    deadlines = Deadlines(pose_s=0.5, command_s=0.4, tick_s=0.25)
+    law = ControlLaw(replace(ControllerSettings(deadlines, arming=AUTOMATIC).without_obstacles), 0)
+    now_ns = 10**12
+    law.take(ControllerPose(now_ns - round(pose_age_s * 1e9), 0.0, 0.0, "tracking"))
+    law.take(TimedSetpoint(now_ns - round(command_age_s * 1e9), Setpoint(0.1)))
+    return law.step(now_ns, 0.05, late_s=late_s).reason
+
+
+def test_deadlines_are_in_time_and_a_stamp_of_the_future_is_not() -> None:
+    """A camera with wrong stamps must not give a pose that never goes stale."""
+    assert reason_for() == reason_for(0.5, 0.4, 0.25) == reason_for(-0.001, -0.001) == ""
+    assert reason_for(pose_age_s=0.51) == reason_for(pose_age_s=-0.51) == POSE_STALE
+    assert reason_for(command_age_s=0.41) == reason_for(command_age_s=-0.41) == COMMAND_STALE
+    assert reason_for(late_s=0.26) == reason_for(late_s=math.nan) == OVERLOADED
 
 
 # Sources of commands: priorities, ownership of a source by one sender, and their end.
@@ -228,11 +190,11 @@ def test_refuses_unknown_sources_and_keeps_the_newest_of_reordered_commands(sele
     assert selector.current is not None and selector.current.arrival_ns == 10**12 + 10**9
 
 
-@pytest.mark.parametrize("names", [(), ("a",) * 2, tuple("abcdefghi"), ("A",), ("a/b",), ("stop",), ("",), ("x" * 33,)])
+@pytest.mark.parametrize("names", [(), ("a",) * 2, ("A",), ("a/b",), ("stop",), ("",), ("x" * 33,)])
 def test_refuses_names_that_are_no_topics(names: tuple[str, ...]) -> None:
     with pytest.raises(OmnidError, match=r"controller\.sources\.names"):
         SourceSettings(names)
-    assert SourceSettings(("a",)).names == ("a",) and len(SourceSettings(tuple("abcdefgh")).names) == 8
+    assert SourceSettings(("a",)).names == ("a",)
 
 
 # The law of motion: heading controller, limits of speed, and goals for motor controllers that hold headings.
@@ -328,20 +290,3 @@ def test_is_finite_and_bounded_after_any_previous_motion(seed: int) -> None:
     for _ in range(3000):
         sent = OF_WHEELS.step(*(Twist(any_speed(rng), any_speed(rng)) for _ in range(2)), any_speed(rng))
         assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
-
-
-OF_HOLDER = VelocityLimits(yaw_rate_radps=0.8, yaw_acceleration_radps2=2.0)
-
-
-@pytest.fixture
-def goal() -> HeadingGoal:
-    return HeadingGoal(OF_HOLDER)
-
-
-def test_a_base_that_turns_too_fast_is_to_hold_its_heading(goal: HeadingGoal) -> None:
-    goal.update(0.0, 0.87)
-    assert goal.towards(0.2) == pytest.approx(0.2), "a little more than the limit is lag"
-    for rate_radps, turn_rad, expected_rad in ((0.89, 0.2, 0.0), (-0.89, -0.2, 0.0), (-1.2, 0.2, 0.2)):
-        goal.stay()
-        goal.update(0.0, rate_radps)
-        assert goal.towards(turn_rad) == pytest.approx(expected_rad)

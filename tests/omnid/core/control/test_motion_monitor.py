@@ -11,16 +11,17 @@ import pytest
 
 from omnid.core.control.heading_controller import Twist, VelocityLimits
 from omnid.core.control.motion_monitor import (
+    BATTERY_EMPTY,
     NOT_COMMANDED,
     NOT_FOLLOWED,
     NOT_SEEN,
+    POSE_UNSURE,
     REST_S,
     Motion,
-    MotionMonitor,
     MotionSettings,
+    Plausibility,
+    TrustSettings,
 )
-from omnid.core.control.safety_rules import SafetyInputs
-from omnid.core.control.trust import MotorReport, Plausibility, TrustSettings
 
 TICK_S, POSE_S, DELAY_S = 0.05, 0.1, 0.15  # of the ticks, of the poses, from an image to the arrival of its pose
 NS = 10**9
@@ -43,10 +44,10 @@ class World:
 
 def run(
     wish: Wish, seconds: float, world: World | None = None, settings: MotionSettings | None = None
-) -> tuple[MotionMonitor, list[tuple[float, bool, str]]]:
+) -> tuple[Plausibility, list[tuple[float, bool, str]]]:
     """Return the monitor, and time, doubt and reason of each tick."""
     world, rng = world or World(), random.Random(7)
-    monitor, commanded, wheels = MotionMonitor(settings or MotionSettings()), Twist(), Twist()
+    monitor, commanded, wheels = Plausibility(TrustSettings(), settings or MotionSettings()), Twist(), Twist()
     waiting: list[tuple[float, Motion]] = []
     history = []
     for tick in range(round(seconds / TICK_S)):
@@ -58,13 +59,13 @@ def run(
             wheels.velocity_mps + share * (commanded.velocity_mps - wheels.velocity_mps),
             wheels.yaw_rate_radps + share * (commanded.yaw_rate_radps - wheels.yaw_rate_radps),
         )
-        monitor.add_report(round(now_s * NS), world.reported(now_s, Motion(*_pair(wheels))))
+        monitor.add_report(round(now_s * NS), world.reported(now_s, Motion(*_pair(wheels))), 0, math.nan)
         if now_s >= len(waiting) * world.steps_s:
             moved = Motion(world.grip * wheels.velocity_mps, world.grip * wheels.yaw_rate_radps, 0.01, 0.01)
             noisy = moved._replace(velocity_mps=moved.velocity_mps + rng.gauss(0, world.noise_mps))
             waiting.append((now_s, world.seen(now_s, noisy)))
         for stamp_s, motion in [entry for entry in waiting if now_s - TICK_S < entry[0] + DELAY_S <= now_s]:
-            monitor.add_seen(round(stamp_s * NS), motion)
+            monitor.add_pose(round(stamp_s * NS), "tracking", motion, 0)
         history.append((now_s, monitor.is_doubtful, monitor.reason))
     return monitor, history
 
@@ -181,16 +182,12 @@ STILL = Motion(0.0, 0.0)
 SURE, UNSURE, TURNING = (0.01, 0.01), (0.5, 0.01), (0.01, 0.9)
 
 
-def judged(plausibility: Plausibility) -> SafetyInputs:
-    return plausibility.added_to(SafetyInputs(0.0, "tracking", 0.0))
-
-
 def is_unsure(*sigmas: tuple[float, float], settings: TrustSettings | None = None) -> bool:
     """Return whether the pose is unsure after poses 0.1 s apart, with sigmas of velocity and yaw rate."""
     plausibility = Plausibility(settings or TrustSettings(), MotionSettings())
     for number, pair in enumerate(sigmas):
         plausibility.add_pose(number * NS // 10, "tracking", Motion(0.0, 0.0, *pair), 0)
-    return judged(plausibility).pose_unsure
+    return POSE_UNSURE in plausibility.take()
 
 
 @pytest.mark.parametrize("sigmas", [UNSURE, TURNING, (math.nan, 0.0), (math.inf, math.inf)])
@@ -208,8 +205,8 @@ def test_a_battery_is_empty_once_its_voltage_stays_low() -> None:
         """Return after each report, 0.5 s apart, whether the battery is empty."""
         plausibility, found = Plausibility(TrustSettings(battery_v=level_v), MotionSettings()), []
         for number, battery_v in enumerate(volts):
-            plausibility.add_report(number * NS // 2, MotorReport(STILL, 0, battery_v))
-            found.append(judged(plausibility).battery_empty)
+            plausibility.add_report(number * NS // 2, STILL, 0, battery_v)
+            found.append(BATTERY_EMPTY in plausibility.take())
         return found
 
     assert reports(12.0, *[10.9] * 5) == [False] * 5 + [True], "2 s"
