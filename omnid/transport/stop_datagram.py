@@ -43,7 +43,7 @@ class StopListener:
     def __init__(self, config: BusConfig, on_stop: Callable[[], None], is_stopped: Callable[[], bool]) -> None:
         """on_stop: called for each request. is_stopped: True if the robot is disarmed by a stop."""
         self._robot, self._on_stop, self._is_stopped = config.robot.encode(), on_stop, is_stopped
-        self._longest = len(_request(config.robot)) + 1  # of more than a request is none
+        self._longest = 2 * len(_request(config.robot))  # bytes that are read of a datagram, so that a tail is seen
         own, proves = ("localhost", "127.0.0.1", "::1"), needs_proof(config)
         found = [(host if host in own or not proves else own[1], port) for host, port in addresses(config.listen)]
         self._sockets = _sockets(found, listens=True)
