@@ -155,7 +155,6 @@ def doctor(args: argparse.Namespace) -> int:
     return int(any(finding.level == "error" for finding in found))
 
 
-SETTLE = 10  # images of a camera that are skipped: its exposure adapts in the first ones
 _ADVICE = """
 To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are plugged in, put this into {file}
 (exchange lower and upper if they are the other way round), then run
@@ -213,7 +212,7 @@ def _images(settings: V4l2Settings, camera: Camera) -> list[Image]:
             source.close()
 
     with closing(V4l2Camera(settings, camera, on_event=end_when_lost)) as source:
-        return [gray(frame) for frame in islice(source.frames(), SETTLE, SETTLE + snapshot.IMAGES)]
+        return [gray(frame) for frame in islice(source.frames(), snapshot.IMAGES, 2 * snapshot.IMAGES)]
 
 
 @command(SETTINGS)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
-from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, Sheet, draw_ends, draw_plan, with_legend
+from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, draw_ends, draw_plan, sheet_of, with_legend
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.world import World, distances_m
@@ -22,8 +22,6 @@ Array = NDArray[np.float64]
 ROUTE: Final = "demo"
 STRAIGHT_M, RADIUS_M = 0.8, 0.7  # The oval that is taught: 6 m.
 ARC_STEPS: Final = 15
-PX_PER_M: Final = 90.0
-BORDER_M: Final = 0.25  # around the world
 LEGEND: Final = (  # colour (BGR) and width [px]
     ("taught path", BLACK, 5),
     ("repeated path", RED, 2),
@@ -120,8 +118,7 @@ def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray
     All are positions (N, 2) [m] in the world. A cell is the darker, the more often something was seen there.
     """
     segments = world.obstacles(1.2)
-    corners = segments.reshape(-1, 2)
-    sheet = Sheet(corners.min(axis=0) - BORDER_M, corners.max(axis=0) + BORDER_M, PX_PER_M)
+    sheet = sheet_of(obstacles, segments.reshape(-1, 2))
     taught, repeated, _, walls = LEGEND
     lines = [Lines(list(segments), *walls[1:]), Lines([first], *taught[1:]), Lines([second], *repeated[1:])]
     image = draw_plan(sheet, obstacles, np.ones(len(obstacles), np.float32), lines)
