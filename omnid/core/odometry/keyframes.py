@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -23,19 +23,6 @@ Array = NDArray[np.float64]
 # Share of the landmarks of a first keyframe that match at one disparity only, below which the others are left out:
 # rendered rooms with a wall of bricks have 0.42 and more. Left out everywhere, they double the error of the scale.
 LEAST_UNIQUE_SHARE = 0.4
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class KeyframeRequest:
-    """A frame with a pose that is to become a keyframe, and the landmarks that are known in it."""
-
-    frame: StereoFrame
-    usable: NDArray[np.bool_]  # (H, W) pixels in which landmarks may lie
-    T_odom_rect: Array  # (4, 4)
-    covariance: Array  # (6, 6) [t; r] in the rectified frame
-    exposure: Exposure
-    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px of the known landmarks
-    views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) px of them at the stamp
 
 
 class Keyframes:
@@ -67,16 +54,26 @@ class Keyframes:
         sparse = inliers < limits.refresh * self._limits.features and self._tracked_s >= limits.sparse_s
         return sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers
 
-    def add(self, request: KeyframeRequest) -> None:
-        """Add a keyframe with new landmarks between the known ones."""
-        frame = request.frame
-        free = clear_around(request.usable, request.pixels)
-        points = corners(frame.lower, free, self._limits.features - len(request.pixels))
-        new = located(frame, points, self._model, self._klt, request.exposure, request.views)
-        keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
+    def add(
+        self,
+        frame: StereoFrame,
+        usable: NDArray[np.bool_],
+        T_odom_rect: Array,
+        covariance: Array,
+        exposure: Exposure,
+        known: PoseEstimate | None = None,
+    ) -> None:
+        """Add a frame with its pose (4, 4) and covariance (6, 6) as a keyframe, with new landmarks.
+
+        usable (H, W): pixels in which they may lie. known: the estimate whose landmarks stay; None: all are new.
+        """
+        pixels, views = (np.zeros((0, 2)), np.zeros((0, 3))) if known is None else (known.pixels, known.views)
+        points = corners(frame.lower, clear_around(usable, pixels), self._limits.features - len(pixels))
+        new = located(frame, points, self._model, self._klt, exposure, views)
+        keyframe = Keyframe(frame.seq, frame.lower, T_odom_rect, covariance)
         self._map.add_located(keyframe, new)
         if len(self._map) >= self._limits.min_inliers:
-            self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
+            self._relocaliser.add(replace(frame, exposure=exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0
 
 

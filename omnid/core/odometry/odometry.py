@@ -6,7 +6,9 @@ VisualOdometry.process is the algorithm, one frame at a time. Equations and sect
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import ROOM_M, OdometryEstimate, OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
 from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
-from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
+from omnid.core.odometry.keyframes import KeyframeLocaliser, Keyframes
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, OtherMotion
@@ -90,7 +92,7 @@ class VisualOdometry:
         self._T_at_fix = self._T_odom_rect  # the last accepted pose
         self._step: Array | None = None  # last step by the cameras
         self._first: StereoFrame | None = None  # started the map before its velocity was known
-        self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
+        self._add_keyframe: Callable[[], None] | None = None  # the keyframe that the last frame asked for
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
         self._cost: tuple[float, int] | None = None  # of those in view, and their number; None: no pose was found
         self.breaks = None if raw_images is None else ImageBreaks(model, raw_images)
@@ -118,9 +120,9 @@ class VisualOdometry:
 
         Called between the two, it gives the same results, and the pose is not held up.
         """
-        requested, self._requested = self._requested, None
-        if requested is not None:
-            self._keyframes.add(requested)
+        add, self._add_keyframe = self._add_keyframe, None
+        if add is not None:
+            add()
 
     def relocalise(self, frame: StereoFrame, exposure: Exposure) -> PoseEstimate | None:
         """Return the pose of a frame among the newest keyframes, refined by the patches of the local map in view."""
@@ -166,8 +168,13 @@ class VisualOdometry:
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(now, estimate, is_reset=bool(np.linalg.norm(gap[3:]) > JUMP_RAD))
         exposure = self._exposure(frame, dt_s)
-        self._requested = self._update_map(now, estimate, exposure)
-        features, is_keyframe = Features(estimate.pixels, estimate.rejected), self._requested is not None
+        self._map.accept(frame.lower, estimate)
+        is_keyframe = self._keyframes.is_due(len(estimate.landmarks), dt_s)
+        if is_keyframe:
+            pose = self._T_odom_rect, self._motion.pose_covariance
+            known = None if self._limits.keyframes == 1 else estimate
+            self._add_keyframe = partial(self._keyframes.add, frame, now.usable, *pose, exposure, known)
+        features = Features(estimate.pixels, estimate.rejected)
         exposure = exposure if is_keyframe else self._exposure(frame)
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
         return replace(result, is_keyframe=is_keyframe)
@@ -214,7 +221,8 @@ class VisualOdometry:
             velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found[0].T_odom_rect, now.dt_s)
             self._map.clear()
             exposure = Exposure.of(first.times, velocity, self._model)
-            self._keyframes.add(self._request(first, now.usable & first.usable, exposure))
+            pose = self._T_odom_rect, self._motion.pose_covariance
+            self._keyframes.add(first, now.usable & first.usable, *pose, exposure)
             exposure = Exposure.of(now.frame.times, velocity, self._model)
             again = self._search.estimate(now.frame, found[0].T_odom_rect, exposure, is_near=True)
             found = [] if again is None else [again]
@@ -320,7 +328,7 @@ class VisualOdometry:
     def _start_map(self, now: _Prediction, *, carried: bool, is_elsewhere: bool = False) -> OdometryEstimate:
         """Start a map at the current pose if the frame has enough landmarks; the facts: see Tracking."""
         exposure = self._exposure(now.frame)
-        self._keyframes.add(self._request(now.frame, now.usable, exposure))
+        self._keyframes.add(now.frame, now.usable, self._T_odom_rect, self._motion.pose_covariance, exposure)
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._tracking.miss(now.dt_s, carried=carried)
@@ -330,20 +338,6 @@ class VisualOdometry:
         self._tracking.start(carried=carried, is_elsewhere=is_elsewhere)
         self._T_at_fix = self._T_odom_rect
         return replace(self._result(len(self._map), len(self._map), exposure=exposure), is_keyframe=True)
-
-    def _update_map(self, now: _Prediction, estimate: PoseEstimate, exposure: Exposure) -> KeyframeRequest | None:
-        """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
-        self._map.accept(now.frame.lower, estimate)
-        if not self._keyframes.is_due(len(estimate.landmarks), now.dt_s):
-            return None
-        request = self._request(now.frame, now.usable, exposure)
-        return (
-            request if self._limits.keyframes == 1 else replace(request, pixels=estimate.pixels, views=estimate.views)
-        )
-
-    def _request(self, frame: StereoFrame, usable: Flags, exposure: Exposure) -> KeyframeRequest:
-        """Return the request of a keyframe at the current pose, all of whose landmarks are new."""
-        return KeyframeRequest(frame, usable, self._T_odom_rect, self._motion.pose_covariance, exposure)
 
     def _result(
         self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
