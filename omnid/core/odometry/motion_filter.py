@@ -53,9 +53,6 @@ SLIPPING, MOST_OUTLIERS = 2, 40
 # The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
 # mean of the squared innovations by their expected values, over 50 steps because a floor is the same for some seconds.
 NOISE_GAIN = 0.02
-# Rotation by which two steps of a robot do not differ, because 4 rad/s^2, more than controller.limits allows by
-# default, make 0.04 rad in steps of 0.1 s.
-SUDDEN_RAD = 0.14
 
 
 class MotionFilter:
@@ -202,18 +199,12 @@ class MotionFilter:
         *,
         interval_s: tuple[float, float] | None,
         is_sure: bool,
-        exposed_at_once: bool,
-    ) -> RigVelocity | None:
+    ) -> RigVelocity:
         """Update the filter with the step that the cameras found (eq. 11), with its covariance (6, 6).
 
         is_sure: the sensors are compared with it. Returns the velocity at the pair before the step, from the steps
         around it. A velocity that changes evenly is exact there; how far it changes unevenly in a step, no step shows.
-        A sudden turn shows no velocity during the exposures: where it matters, the filter begins from standstill.
         """
-        turned = se3.log(T_prev_curr)[3:] - self.velocity[3:] * dt_s
-        if not exposed_at_once and np.linalg.norm(turned) > SUDDEN_RAD:
-            self.reset()
-            return None
         # 1. The cameras, and then the sensors, each if it agrees.
         is_compared = is_sure and interval_s is not None
         if is_compared:

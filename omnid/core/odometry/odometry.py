@@ -33,9 +33,6 @@ from omnid.tracking_state import TrackingState
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Rounds of starting the map again, because the depths of the first frame are measured as if the rig were at rest, so
-# that the motion is wrong by a few per cent of what happens between two exposures, and each reduces it by this ratio.
-START_ROUNDS = 2
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
 TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
@@ -213,20 +210,18 @@ class VisualOdometry:
     def _start_again(self, now: _Prediction, found: list[PoseEstimate]) -> list[PoseEstimate]:
         """Start the map again at its first frame, whose velocity this one shows; return the pose in that map."""
         first, self._first = self._first, None
-        if first is None or not 0 < now.dt_s <= self._limits.max_gap_s:
+        is_step = 0 < now.dt_s <= self._limits.max_gap_s
+        if first is None or not is_step or not found or not self._is_plausible(found[0], now):
             return found
-        for _ in range(START_ROUNDS):
-            if not found or not self._is_plausible(found[0], now):
-                break
-            velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found[0].T_odom_rect, now.dt_s)
-            self._map.clear()
-            exposure = Exposure.of(first.times, velocity, self._model)
-            pose = self._T_odom_rect, self._motion.pose_covariance
-            self._keyframes.add(first, now.usable & first.usable, *pose, exposure)
-            exposure = Exposure.of(now.frame.times, velocity, self._model)
-            again = self._search.estimate(now.frame, found[0].T_odom_rect, exposure, is_near=True)
-            found = [] if again is None else [again]
-        return found
+        # The depths of the first frame were measured as if the rig were at rest, so that this step is wrong by a few
+        # per cent of what happens between two exposures.
+        velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found[0].T_odom_rect, now.dt_s)
+        self._map.clear()
+        pose, exposure = (self._T_odom_rect, self._motion.pose_covariance), Exposure(first.times, velocity, self._model)
+        self._keyframes.add(first, now.usable & first.usable, *pose, exposure)
+        exposure = Exposure(now.frame.times, velocity, self._model)
+        again = self._search.estimate(now.frame, found[0].T_odom_rect, exposure, is_near=True)
+        return [] if again is None else [again]
 
     def _is_plausible(self, estimate: PoseEstimate, now: _Prediction) -> bool:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
@@ -267,7 +262,6 @@ class VisualOdometry:
                 now.dt_s,
                 interval_s=now.frame.interval_s,
                 is_sure=is_sure,
-                exposed_at_once=now.frame.times.is_at_once,
             )
             self._step = T_prev_curr if is_sure else None
         elif not now.is_measured:
