@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.panorama import Cylinder, remap_tables, visible
 from calib.rig import Rig
@@ -36,14 +34,11 @@ TARGET, LEAST_MEAN, SATURATED = 100.0, 60.0, 250.0
 # Dead band: a factor of the light below this one causes no step, so that a step down causes none up. Its square is the
 # largest step. A saturated area is assumed to be too bright by this factor.
 BAND: Final = math.sqrt(2)
-GAIN_STEPS: Final = 16  # A step of the gain is its range by this number, since its unit is not known.
 STEP_S: Final = 0.5  # between two steps: images show a step only some frames later
+USUAL_HZ: Final = 30.0  # rate of cameras that keep their own
 
-ExposureState = Literal["regulated", "too dark", "too bright"]
 
-
-@dataclass(frozen=True, slots=True)
-class GreyLevels:
+class GreyLevels(NamedTuple):
     """Grey levels of an image in the useful area."""
 
     mean: float
@@ -63,22 +58,15 @@ class UsefulArea:
 
     def levels(self, pair: FramePair) -> tuple[GreyLevels, GreyLevels]:
         """Return the levels of the lower and of the upper image."""
-        lower, upper = (image[at] for image, at in zip((pair.lower, pair.upper), self._pixels, strict=True))
-        return _levels(lower), _levels(upper)
-
-
-def _levels(grey: NDArray[np.uint8]) -> GreyLevels:
-    return GreyLevels(float(grey.mean()), float(np.percentile(grey, 97)))
+        greys = (image[at] for image, at in zip((pair.lower, pair.upper), self._pixels, strict=True))
+        lower, upper = (GreyLevels(float(grey.mean()), float(np.percentile(grey, 97))) for grey in greys)
+        return lower, upper
 
 
 def wanted_factor(lower: GreyLevels, upper: GreyLevels) -> float:
     """Return the factor by which the light of both cameras should change, between 1 / BAND^2 and BAND^2."""
-    mean = max(1.0, math.sqrt(lower.mean * upper.mean))
-    factor = TARGET / mean
-    if max(lower.bright, upper.bright) >= SATURATED:
-        factor = min(factor, 1 / BAND)
-    else:
-        factor = min(factor, max(1.0, SATURATED / max(1.0, lower.bright, upper.bright)))
+    mean, bright = max(1.0, math.sqrt(lower.mean * upper.mean)), max(1.0, lower.bright, upper.bright)
+    factor = min(TARGET / mean, 1 / BAND if bright >= SATURATED else SATURATED / bright)
     factor = max(factor, LEAST_MEAN / mean)  # lamps and windows are small: the rest shall stay visible
     return min(max(factor, 1 / BAND**2), BAND**2)
 
@@ -93,40 +81,50 @@ class ExposureLaw:
 
         A longer exposure is a multiple of flicker_us, so that all images get the same light.
         """
-        times, self._gains, self._flicker_us = ranges.exposure_us, ranges.gain, flicker_us
+        times, self._flicker_us = ranges.exposure_us, flicker_us
         self._times = ValueRange(times.low, max(times.low, min(times.high, int(limit_us))), times.step)
-        gain = None
-        if self._gains is not None:
-            gain = self._gains.nearest(self._gains.low if start.gain is None else start.gain)
-            self._gain_step = max(self._gains.step, (self._gains.high - self._gains.low) // GAIN_STEPS)
-        self.setting = ExposureSetting(self._time(start.exposure_us), gain)
-        self.state: ExposureState = "regulated"
+        self._gains = ranges.gain or ValueRange(0, 0)
+        # A step of the gain is a part of its range, since its unit is not known.
+        self._gain_step = max(self._gains.step, (self._gains.high - self._gains.low) // 16)
+        self._has_gain = ranges.gain is not None
+        self._time_us = self._time(start.exposure_us)
+        self._gain = self._gains.nearest(start.gain or self._gains.low)
+        self.state: Literal["regulated", "too dark", "too bright"] = "regulated"
         self.steps = 0
         self._next_ns: float = -math.inf
+
+    @property
+    def setting(self) -> ExposureSetting:
+        """The setting that is wanted now."""
+        return ExposureSetting(self._time_us, self._gain if self._has_gain else None)
 
     def step(self, lower: GreyLevels, upper: GreyLevels, stamp_ns: int) -> ExposureSetting | None:
         """Return the setting from now on; None where it stays. The levels are those of images at the stamp."""
         if stamp_ns < self._next_ns:
             return None
         # 1. The factor on the light that is wanted, and the setting that is nearest to it, with a dead band.
-        factor, before = wanted_factor(lower, upper), self.setting
-        direction = (factor >= BAND) - (factor <= 1 / BAND)
-        wanted = before
-        if direction:
-            wanted = self._raised(factor) if direction > 0 else self._lowered(factor)
-        # Hunting: a coarse step of the time would lead farther beyond the wanted light than it is away now.
-        made = wanted.exposure_us / before.exposure_us
-        hunts = wanted.gain == before.gain and abs(math.log(made)) > 2 * abs(math.log(factor))
+        factor, time_us, gain = wanted_factor(lower, upper), self._time_us, self._gain
         self.state = "regulated"
-        if not direction or hunts:
+        if 1 / BAND < factor < BAND:
             return None
-        # 2. At the end of the range it stays.
-        if wanted == before:
-            self.state = "too dark" if direction > 0 else "too bright"
+        if factor > 1:
+            time_us = max(time_us, self._time(time_us * factor))
+            if time_us == self._time_us:
+                gain = self._gains.nearest(gain + self._gain_step)
+        else:  # where the images are very bright, exposure and gain are lowered at once
+            if gain == self._gains.low or factor <= 1 / BAND**2:
+                time_us = min(time_us, self._time(time_us * factor))
+            gain = self._gains.nearest(gain - self._gain_step)
+        # 2. At the end of the range it stays, and where a coarse step of the time would lead farther beyond the wanted
+        #    light than it is away now.
+        if (time_us, gain) == (self._time_us, self._gain):
+            self.state = "too dark" if factor > 1 else "too bright"
+            return None
+        if gain == self._gain and abs(math.log(time_us / self._time_us)) > 2 * abs(math.log(factor)):
             return None
         self._next_ns = stamp_ns + STEP_S / S_PER_NS
-        self.setting, self.steps = wanted, self.steps + 1
-        return wanted
+        self._time_us, self._gain, self.steps = time_us, gain, self.steps + 1
+        return self.setting
 
     def _time(self, wanted_us: float) -> int:
         """Return the nearest exposure time that the camera and the lamps allow."""
@@ -134,28 +132,6 @@ class ExposureLaw:
         if self._flicker_us and time_us > self._flicker_us:
             time_us = self._times.nearest(time_us // self._flicker_us * self._flicker_us)
         return time_us
-
-    def _raised(self, factor: float) -> ExposureSetting:
-        time_us, gain = self._time(self.setting.exposure_us * factor), self.setting.gain
-        if time_us <= self.setting.exposure_us and self._gains is not None and gain is not None:
-            gain = self._gains.nearest(gain + self._gain_step)
-        return ExposureSetting(max(time_us, self.setting.exposure_us), gain)
-
-    def _lowered(self, factor: float) -> ExposureSetting:
-        time_us, gain = self.setting.exposure_us, self.setting.gain
-        has_gain = self._gains is not None and gain is not None and gain > self._gains.low
-        if self._gains is not None and gain is not None:
-            gain = self._gains.nearest(gain - self._gain_step)
-        # Where the images are very bright, exposure and gain are lowered at once.
-        if not has_gain or factor <= 1 / BAND**2:
-            time_us = min(time_us, self._time(time_us * factor))
-        return ExposureSetting(time_us, gain)
-
-
-USUAL_HZ: Final = 30.0  # rate of cameras that keep their own
-PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.
-# Periods from a pair to the time of its request, so that both cameras carry it out after the same pair.
-AFTER_PERIODS: Final = 1.5
 
 
 class ExposureControl:
@@ -167,11 +143,20 @@ class ExposureControl:
     def __init__(self, area: UsefulArea, config: CamerasConfig, cameras: Mapping[Camera, CameraState]) -> None:
         self._area, self._config = area, config
         self._exposures = [state.exposure for state in cameras.values() if state.exposure is not None]
-        self._left_to_cameras = _reason(config, cameras)
         self._period_ns = NS_PER_S / (config.rate_hz or USUAL_HZ)
         self._law: ExposureLaw | None = None
         self._levels: tuple[GreyLevels, GreyLevels] | None = None  # of the newest measured pair
         self._next_ns: float = -math.inf
+        # Why the exposure is left to the cameras; empty where it is not.
+        self._left_to_cameras = ""
+        if config.exposure_us:
+            self._left_to_cameras = "fixed by cameras.exposure_us"
+        elif config.auto_exposure != "rig":
+            self._left_to_cameras = f'left to the cameras: cameras.auto_exposure = "{config.auto_exposure}"'
+        elif len(self._exposures) < len(cameras):
+            self._left_to_cameras = "left to the cameras: no exposure time to set in one of them"
+        elif (times := _ranges(self._exposures).exposure_us).low > times.high:
+            self._left_to_cameras = "left to the cameras: their exposure times have no value in common"
 
     def process(self, pair: FramePair) -> None:
         """Measure a pair if it is due, and make a request where the law takes a step."""
@@ -185,7 +170,8 @@ class ExposureControl:
             self._left_to_cameras = f"left to the cameras: {problem}"
             self._request(None, pair.stamp_ns)
         elif self._law is None:  # start from the setting of the lower camera
-            limit_us = min(1e3 * self._config.exposure_limit_ms, PERIOD_SHARE * self._period_ns * 1e-3)
+            # The longest exposure leaves a tenth of the images' period to read the image out.
+            limit_us = min(1e3 * self._config.exposure_limit_ms, 0.9e-3 * self._period_ns)
             start = self._exposures[0].in_force or ExposureSetting(int(limit_us))
             mains = self._config.power_line
             flicker_us = 1e6 / (2 * int(mains)) if mains.isdecimal() else 0.0  # lamps shine twice a period
@@ -198,11 +184,9 @@ class ExposureControl:
         """Return exposure, gain and grey levels, and whether it is too dark or too bright."""
         if self._levels is None:
             return {"_words": "no images yet"}
-        lower, upper = self._levels
-        stats: dict[str, object] = {
-            "lower_grey": round(lower.mean),
-            "upper_grey": round(upper.mean),
-        }
+        stats: dict[str, object] = dict(
+            zip(("lower_grey", "upper_grey"), (round(one.mean) for one in self._levels), strict=True)
+        )
         if self._law is None or self._left_to_cameras:
             return stats | {"_words": self._left_to_cameras}
         state, setting = self._law.state, self._law.setting
@@ -215,22 +199,8 @@ class ExposureControl:
     def _request(self, setting: ExposureSetting | None, stamp_ns: int) -> None:
         """Ask both cameras for a setting; None: they regulate themselves."""
         for exposure in self._exposures:
-            exposure.request = ExposureRequest(setting, stamp_ns + int(AFTER_PERIODS * self._period_ns))
-
-
-def _reason(config: CamerasConfig, cameras: Mapping[Camera, CameraState]) -> str:
-    """Return why the exposure is left to the cameras; empty where it is not."""
-    if config.exposure_us:
-        return "fixed by cameras.exposure_us"
-    if config.auto_exposure != "rig":
-        return f'left to the cameras: cameras.auto_exposure = "{config.auto_exposure}"'
-    without = [name for name, state in cameras.items() if state.exposure is None]
-    if without:
-        return f"left to the cameras: no exposure time to set in the {' and the '.join(without)} camera"
-    ranges = _ranges([state.exposure for state in cameras.values() if state.exposure is not None])
-    if ranges.exposure_us.low > ranges.exposure_us.high:
-        return "left to the cameras: their exposure times have no value in common"
-    return ""
+            # From the middle of the next period on, so that both cameras carry it out after the same pair.
+            exposure.request = ExposureRequest(setting, stamp_ns + int(1.5 * self._period_ns))
 
 
 def _ranges(exposures: Sequence[CameraExposure]) -> ExposureRanges:

@@ -179,7 +179,7 @@ def test_says_when_it_is_too_dark_or_too_bright_and_what_to_do(area: UsefulArea)
 @pytest.mark.parametrize(
     ("config", "ranges", "words"),
     [(CamerasConfig(auto_exposure="on"), (RANGES, RANGES), 'cameras.auto_exposure = "on"'),
-     (CamerasConfig(), (RANGES, None), "no exposure time to set in the upper camera"),
+     (CamerasConfig(), (RANGES, None), "no exposure time to set"),
      (CamerasConfig(), (RANGES, ExposureRanges(ValueRange(300_000, 400_000))), "no value in common")],
 )  # fmt: skip
 def test_leaves_the_exposure_to_the_cameras_and_says_why(
