@@ -255,7 +255,7 @@ def ask(question: str, at_end: str | None = None) -> str:
 
 @command()
 def install_service(args: argparse.Namespace) -> int:
-    """Install the systemd unit for this program, example udev rules, a minimal configuration and its user.
+    """Install the systemd unit for this program, example udev rules and a minimal configuration.
 
     Files that people edit are kept where they exist. Exit code 1: the answer to the question was no.
 
@@ -270,18 +270,17 @@ def install_service(args: argparse.Namespace) -> int:
     if args.page:
         require_packages()
     program = Path(sys.prefix) / "bin" / "omnid"
-    steps = install.steps(program, page=args.page)
-    for step in steps:
-        print(step.description)
+    texts = install.files_to_write(program, page=args.page)
+    for path in texts:
+        print(f"write {path}")
     if args.dry_run:
         return 0
-    if not steps:
+    if not texts:
         print("nothing to do")
         return 0
     if not args.yes and ask("Do this? [y/N] ", "").lower() not in ("y", "yes"):
         print("nothing was changed")
         return 1
-    for step in steps:
-        step.act()
-    print(install.next_steps(program, page=args.page))
+    install.write(texts)
+    print(install.NEXT_STEPS.format(program=program, units="omnid omnid-web" if args.page else "omnid"))
     return 0

@@ -8,16 +8,16 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from drivers.cameras.v4l2_device import CaptureDevice, udev_rules
 from omnid.config import Config, load_config
-from omnid.engine.realtime import RealtimeSettings
+from omnid.engine.process import RealtimeSettings
 from omnid.errors import OmnidError
 from omnid.service import install
-from omnid.service.install import steps
 from tests.replay.command import Command
 
 ROOT = Path(__file__).parents[3]
@@ -102,51 +102,37 @@ def test_the_examples_of_udev_are_commented_and_those_of_cameras_are_what_omnid_
     assert list(udev_rules(devices)) == examples and len(examples) == 2
 
 
-PROGRAM = Path("/srv/robot/bin/omnid")
 FILES = ("etc/systemd/system/omnid.service", "etc/udev/rules.d/90-omnid.rules", "etc/omnid/omnid.toml")
 
 
-def done(tmp_path: Path, page: bool = False) -> list[str]:
-    """Take the steps that write files, and return what they say."""
-    taken = [step for step in steps(PROGRAM, page=page, root=tmp_path) if str(tmp_path) in step.description]
-    for step in taken:
-        step.act()
-    return [step.description for step in taken]
-
-
-def test_writes_the_unit_of_this_program_and_keeps_edited_files(tmp_path: Path) -> None:
-    assert done(tmp_path) == [f"write {tmp_path / name}" for name in FILES]
-    unit, rules, config = (tmp_path / name for name in FILES)
-    assert "ExecStart=/srv/robot/bin/omnid run --config /etc/omnid/omnid.toml\n" in unit.read_text()
-    assert "/opt/omnid" not in unit.read_text()
-    assert rules.read_text() == (ROOT / "systemd" / rules.name).read_text()
-    assert load_config(config) == Config()
-    assert done(tmp_path) == []
-    rules.write_text("mine")
-    unit.write_text("older")
-    assert done(tmp_path) == [f"replace {unit}"] and rules.read_text() == "mine" and "ExecStart" in unit.read_text()
-    assert done(tmp_path, page=True) == [f"write {tmp_path / 'etc/systemd/system/omnid-web.service'}"]
-    page = (tmp_path / "etc/systemd/system/omnid-web.service").read_text()
-    assert "ExecStart=/srv/robot/bin/omnid web --config /etc/omnid/omnid.toml" in page and "/opt/omnid" not in page
-
-
-def test_the_command_asks_first(
+def test_writes_the_unit_of_this_program_and_keeps_edited_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def files_only(program: Path, *, page: bool) -> list[install.Step]:
-        return [step for step in steps(program, page=page, root=tmp_path) if str(tmp_path) in step.description]
-
+    """The command asks first."""
     omnid = Command(capsys)
     monkeypatch.setattr(sys, "prefix", "/srv/robot")
-    monkeypatch.setattr(install, "steps", files_only)
+    monkeypatch.setattr(install, "files_to_write", partial(install.files_to_write, root=tmp_path))
     monkeypatch.setattr(sys, "stdin", io.StringIO("n\ny\n"))
+    # 1. What would be written, and what was.
     listed = omnid("install-service", "--dry-run").out
-    assert [str(tmp_path / name) for name in FILES] == [line.split()[1] for line in listed.splitlines()]
+    unit, rules, config = (tmp_path / name for name in FILES)
+    assert [f"write {path}" for path in (unit, rules, config)] == listed.splitlines()
     refused = omnid("install-service")
     assert refused.code == 1 and refused.out.endswith("nothing was changed\n") and list(tmp_path.iterdir()) == []
-    agreed = omnid("install-service", "--page")
-    assert agreed.code == 0 and "enable --now omnid omnid-web" in agreed.out and (tmp_path / FILES[0]).exists()
-    assert omnid("install-service", "--page").out == "nothing to do\n"
+    agreed = omnid("install-service")
+    assert agreed.code == 0 and "enable --now omnid" in agreed.out and "useradd" in agreed.out
+    assert "ExecStart=/srv/robot/bin/omnid run --config /etc/omnid/omnid.toml\n" in unit.read_text()
+    assert "/opt/omnid" not in unit.read_text() and load_config(config) == Config()
+    assert rules.read_text() == (ROOT / "systemd" / rules.name).read_text()
+    assert omnid("install-service").out == "nothing to do\n"
+    # 2. Files that people edit are kept.
+    rules.write_text("mine")
+    unit.write_text("older")
+    again = omnid("install-service", "--yes", "--page").out
+    assert f"write {unit}" in again and rules.read_text() == "mine" and "ExecStart" in unit.read_text()
+    page = (tmp_path / "etc/systemd/system/omnid-web.service").read_text()
+    assert "ExecStart=/srv/robot/bin/omnid web --config /etc/omnid/omnid.toml" in page and "/opt/omnid" not in page
+    # 3. A system that cannot be changed.
     shutil.rmtree(tmp_path / "etc")
     (tmp_path / "etc").write_text("a file")
     failed = omnid("install-service", "--yes")
@@ -163,7 +149,7 @@ def test_the_command_asks_first(
 )
 def test_refuses_a_program_that_the_unit_cannot_start(program: str, message: str) -> None:
     with pytest.raises(OmnidError, match=message):
-        steps(Path(program))
+        install.files_to_write(Path(program))
 
 
 @pytest.mark.slow
