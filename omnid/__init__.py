@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from omnid.config import load_config as load_config
     from omnid.errors import OmnidError as OmnidError
     from omnid.messages import OdometryUpdate as OdometryUpdate
-    from omnid.runs.run_result import RunResult as RunResult
+    from omnid.runs.replay import RunResult as RunResult
     from omnid.tracking_state import TrackingState as TrackingState
 
 _MODULES = {
@@ -41,7 +41,7 @@ _MODULES = {
     "Odometry": "omnid.api",
     "OdometryUpdate": "omnid.messages",
     "OmnidError": "omnid.errors",
-    "RunResult": "omnid.runs.run_result",
+    "RunResult": "omnid.runs.replay",
     "TrackingState": "omnid.tracking_state",
     "calibrate_drive": "omnid.calibration.drive",
     "calibrate_height": "omnid.calibration.from_log",

@@ -27,8 +27,7 @@ from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
 from omnid.messages import DensePoints, OdometryUpdate
-from omnid.runs.replay import ReplayOptions, run_log
-from omnid.runs.run_result import RunResult
+from omnid.runs.replay import ReplayOptions, RunResult, run_log
 from omnid.settings import dump, parse
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry

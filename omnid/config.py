@@ -22,7 +22,7 @@ from omnid.core.odometry.motion_settings import MotionSensorSettings
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.place_map import PlaceLimits
 from omnid.core.stereo.matcher import MatchingSettings
-from omnid.engine.realtime import RealtimeSettings
+from omnid.engine.process import RealtimeSettings
 from omnid.errors import OmnidError
 from omnid.settings import changed, load
 from omnid.transport.bus_config import BusConfig

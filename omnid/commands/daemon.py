@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
@@ -15,7 +14,6 @@ import cv2
 import numpy as np
 
 from calib import se3
-from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from calib.se2_arrays import transform
 from drivers.cameras.log_camera import LogCamera, LogImages, LogMotion, LogPlayback
@@ -26,12 +24,12 @@ from omnid.commands.replay import replay_and_print
 from omnid.config import Config, unused_settings
 from omnid.controller.motor import SIMULATED
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.logging_setup import HANDLER, log
+from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.navigation_state import NavigationState
 from omnid.recordings.evaluation import evaluate
-from omnid.runs.live import ConnectedRobot, LiveRobot, LiveRun
+from omnid.runs.live import ConnectedRobot, run_live
 from omnid.runs.record import record as record_frames
 from omnid.runs.replay import ReplayOptions
 from omnid.runs.session import attached_rig, motion_topics
@@ -67,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if args.log is None:
         if args.once or args.pace != 1.0:
             raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
-        return _live_run(config, ConnectedRobot(device_opener(config))).run()
+        run_live(config, ConnectedRobot(device_opener(config)), log)
+        return 0
     return _run_log(args, replace(config, controller=config.controller.of_log))
 
 
@@ -77,11 +76,6 @@ def _settings(args: argparse.Namespace, more: Mapping[str, object] | None = None
     for warning in unused_settings(config, "run", args.set):
         log(logging.WARNING, warning)
     return config
-
-
-def _live_run(config: Config, robot: LiveRobot, rig: Rig | None = None) -> LiveRun:
-    """Return a live run that reports on stderr."""
-    return LiveRun(config, robot, log, rig, HANDLER.show if sys.stderr.isatty() else None)
 
 
 def _run_log(args: argparse.Namespace, config: Config) -> int:
@@ -103,7 +97,8 @@ def _run_log(args: argparse.Namespace, config: Config) -> int:
     if not args.rig:
         with closing(LogReader(args.log, args.lower, args.upper)) as reader:
             rig = attached_rig(reader, args.log)
-    return _live_run(config, ConnectedRobot(open_camera, open_motion), rig).run()
+    run_live(config, ConnectedRobot(open_camera, open_motion), log, rig)
+    return 0
 
 
 @command(MAP, SETTINGS)
@@ -135,15 +130,14 @@ def simulate(args: argparse.Namespace) -> int:
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
     paced = PacedRobot(world, robot, config, args.seed)
-    run = _live_run(config, paced, paced.rig)
-    code = run.run()
+    clock = run_live(config, paced, log, paced.rig)
     # 2. Write the truth, and report contacts.
     if args.truth:  # the poses of the base since the first one, with the stamps of the poses on the bus
         T = np.array([transform(np.array(pose)) for pose in paced.truth.values()]).reshape(-1, 4, 4)
-        stamps_ns = np.array([run.clock.unix_ns(stamp_ns) for stamp_ns in paced.truth], np.int64)
+        stamps_ns = np.array([clock.unix_ns(stamp_ns) for stamp_ns in paced.truth], np.int64)
         write_trajectory(args.truth, stamps_ns, se3.inverse(T[:1]) @ T)
     log(logging.INFO, f"contacts with obstacles: {paced.contacts}")
-    return code
+    return 0
 
 
 DRIVE_S = 90.0  # Longest drive in simulated time.

@@ -25,7 +25,7 @@ from omnid.core.control.contacts import NO_CONTACT, ContactState
 from omnid.core.control.control_law import ControlInput, ControllerSettings
 from omnid.core.control.motion_monitor import ADVICE, CONFLICTS, DISAGREEMENTS, MOTION_DOUBTFUL, Conflict
 from omnid.core.control.safety_rules import ENDS, IDLE
-from omnid.engine.realtime import RealtimeSettings
+from omnid.engine.process import RealtimeSettings
 
 # The wheels are ramped down when the daemon ends. Wheels that still turn after this time are stopped at once, so that
 # the process ends.

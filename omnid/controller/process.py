@@ -26,8 +26,7 @@ from omnid.controller.ipc import (
 )
 from omnid.controller.motor import open_motor
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.process import STOP_SIGNALS
-from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
+from omnid.engine.process import STOP_SIGNALS, RealtimeSettings, prepare, start_thread
 
 THREAD_NAME: Final = "controller"
 MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
@@ -94,7 +93,7 @@ def prepare_process(settings: RealtimeSettings) -> str:
     """Set priority, memory and garbage collection for punctual ticks; return what was refused, or an empty string."""
     prepare(settings)  # What is refused here was refused to the daemon too, which logs it.
     refused: list[str] = []
-    ThreadStart({THREAD_NAME: settings.motor_priority}, lambda _, line: refused.append(line))(THREAD_NAME)
+    start_thread({THREAD_NAME: settings.motor_priority}, lambda _, line: refused.append(line), THREAD_NAME)
     return " ".join(refused)
 
 

@@ -23,7 +23,7 @@ from drivers.errors import DriverError
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.config import RecordConfig
 from omnid.controller.motor import SIMULATED, MotorSettings
-from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
+from omnid.engine.process import LOCK_ADVICE, PRIORITY_ADVICE, highest_priority, may_lock
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import zenoh_config
@@ -116,7 +116,7 @@ def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
     highest, locks = highest_priority(), may_lock()
     if priority > highest:
         refused = f"priority {priority} is not allowed, this user may have {highest}; the unit sets LimitRTPRIO"
-        yield Finding("warning", "real time", refused, priority_advice(priority))
+        yield Finding("warning", "real time", refused, PRIORITY_ADVICE)
     else:
         yield Finding("ok", "real time", f"priorities up to {highest} are allowed")
     if lock_memory and not locks:

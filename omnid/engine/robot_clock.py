@@ -16,7 +16,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.graph import nothing
@@ -26,18 +26,8 @@ STEP_NS: Final = 1_000_000  # less than two images of a pair are apart, more tha
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
 
 
-class _Offset(NamedTuple):
-    """An offset from CLOCK_MONOTONIC to Unix time, and the stamp from which on it is in force; -inf for the first."""
-
-    since_ns: float
-    offset_ns: int
-
-
 class RobotClock:
-    """Both clocks of a run; for any thread.
-
-    steps: number of steps. step_at_ns, step_s: stamp and size of the newest one; forwards is positive.
-    """
+    """Both clocks of a run; for any thread. steps: number of steps of Unix time so far."""
 
     def __init__(
         self,
@@ -46,74 +36,44 @@ class RobotClock:
         report: Callable[[str], object] = nothing,
     ) -> None:
         """monotonic_ns: the clock of the stamps. unix_ns: the clock that may be set. report: takes a line at a step."""
-        self.monotonic_ns = monotonic_ns
-        self._unix_ns, self._report = unix_ns, report
+        self.monotonic_ns, self._unix_ns, self._report = monotonic_ns, unix_ns, report
         self._following = Lock()
-        self._offsets = deque([_Offset(-math.inf, self._measured()[0])], KEPT)
-        self.steps, self.step_at_ns, self.step_s = 0, 0, 0.0
+        # Stamps from which on an offset is in force [ns], with the offset.
+        self._offsets = deque[tuple[float, int]]([(-math.inf, self._measured()[1])], KEPT)
+        self.steps, self._step_at_ns, self._words = 0, 0, "followed"
 
     def follow(self) -> None:
-        """Measure the offset, follow it, and report a step; while another thread does, nothing is to be done."""
-        if not self._following.acquire(blocking=False):
-            return
-        try:
-            is_step = self._follow()
-        finally:
-            self._following.release()
-        if is_step:
-            self._report(
-                f"the computer's clock was set {self._step_words()}: stamps on the bus and in recordings follow it, "
-                "a recording goes on in a new file; ages and deadlines do not change"
-            )
-
-    def _follow(self) -> bool:
-        """Follow the offset, without a step at most once a second; return whether it has made a step."""
-        offset_ns, error_ns, now_ns = self._measured()
-        newest = self._offsets[-1]
-        change_ns = offset_ns - newest.offset_ns
-        is_step = abs(change_ns) > STEP_NS + error_ns
-        if is_step or (abs(change_ns) > error_ns and now_ns - newest.since_ns > NS_PER_S):
-            self._offsets.append(_Offset(now_ns, offset_ns))
-        if is_step:
-            self.steps, self.step_at_ns, self.step_s = self.steps + 1, now_ns, change_ns * S_PER_NS
-        return is_step
+        """Measure the offset, follow it, and report a step; without a step at most once a second."""
+        with self._following:
+            error_ns, offset_ns, now_ns = self._measured()
+            since_ns, before_ns = self._offsets[-1]
+            change_ns = offset_ns - before_ns
+            is_step = abs(change_ns) > STEP_NS + error_ns
+            if is_step or (abs(change_ns) > error_ns and now_ns - since_ns > NS_PER_S):
+                self._offsets.append((now_ns, offset_ns))
+            if not is_step:
+                return
+            how = f"was set {'forwards' if change_ns > 0 else 'back'} by {abs(change_ns) * S_PER_NS:.3f} s"
+            self.steps, self._step_at_ns, self._words = self.steps + 1, now_ns, f"it {how}: the stamps follow it"
+        self._report(f"the computer's clock {how}: stamps follow it, a recording goes on in a new file")
 
     def _measured(self) -> tuple[int, int, int]:
-        """Return the offset, its largest error, and the time of the measurement [ns]; of three the most exact one."""
+        """Return the largest error of an offset, the offset, and the time of both [ns]; of three the most exact one."""
         readings = []
         for _ in range(3):
             before_ns, unix_ns, after_ns = self.monotonic_ns(), self._unix_ns(), self.monotonic_ns()
             readings.append((after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2, after_ns))
-        error_ns, offset_ns, now_ns = min(readings)
-        return offset_ns, error_ns, now_ns
+        return min(readings)
 
-    def _step_words(self) -> str:
-        return f"{'forwards' if self.step_s > 0 else 'back'} by {abs(self.step_s):.3f} s"
-
-    def offset_ns(self, stamp_ns: int) -> int:
+    def _offset_ns(self, stamp_ns: int) -> int:
         """Return the offset from a stamp to Unix time, as it was last measured before the stamp."""
         offsets = tuple(self._offsets)
-        return next((one.offset_ns for one in reversed(offsets) if one.since_ns <= stamp_ns), offsets[0].offset_ns)
+        return next((offset_ns for since_ns, offset_ns in reversed(offsets) if since_ns <= stamp_ns), offsets[0][1])
 
     def unix_ns(self, stamp_ns: int) -> int:
         """Return the Unix time of a stamp."""
         self.follow()
-        return stamp_ns + self.offset_ns(stamp_ns)
-
-    def stamp_ns(self, unix_ns: int) -> int:
-        """Return the stamp of a Unix time: of all that have it, before and after a step, the nearest to now.
-
-        A Unix time that a step has left out is one of a clock that was not set: it counts by the newest offset.
-        """
-        self.follow()
-        stamps = [unix_ns - one.offset_ns for one in tuple(self._offsets)]
-        in_force = [stamp for stamp in stamps if stamp + self.offset_ns(stamp) == unix_ns]
-        now_ns = self.monotonic_ns()
-        return min(in_force, key=lambda stamp: abs(now_ns - stamp), default=stamps[-1])
-
-    def age_ns(self, unix_ns: int) -> int:
-        """Return the time since a Unix time; below 0 where it is to come."""
-        return self.monotonic_ns() - self.stamp_ns(unix_ns)
+        return stamp_ns + self._offset_ns(stamp_ns)
 
     def segment_unix_ns(self, stamp_ns: int) -> int:
         """Return the Unix time in a recording, whose files have no step in them: each step begins a new file.
@@ -121,16 +81,27 @@ class RobotClock:
         What belongs to the time before a step, but comes after it, has the time of the new file.
         """
         self.follow()
-        return stamp_ns + self.offset_ns(max(stamp_ns, self.step_at_ns))
+        return stamp_ns + self._offset_ns(max(stamp_ns, self._step_at_ns))
+
+    def stamp_ns(self, unix_ns: int) -> int:
+        """Return the stamp of a Unix time: of all that have it, before and after a step, the nearest to now.
+
+        A Unix time that a step has left out is one of a clock that was not set: it counts by the newest offset.
+        """
+        self.follow()
+        stamps = [unix_ns - offset_ns for _, offset_ns in tuple(self._offsets)]
+        in_force = [stamp for stamp in stamps if stamp + self._offset_ns(stamp) == unix_ns]
+        now_ns = self.monotonic_ns()
+        return min(in_force, key=lambda stamp: abs(now_ns - stamp), default=stamps[-1])
+
+    def age_ns(self, unix_ns: int) -> int:
+        """Return the time since a Unix time; below 0 where it is to come."""
+        return self.monotonic_ns() - self.stamp_ns(unix_ns)
 
     def stats(self) -> dict[str, object]:
-        """Return the steps of the clock, and of the newest its size and the time since it [s]."""
+        """Return the number of steps, and the newest one in words."""
         self.follow()
-        if not self.steps:
-            return {"steps": 0, "_words": "followed"}
-        since_s = round((self.monotonic_ns() - self.step_at_ns) * S_PER_NS)
-        words = f"it was set {self._step_words()}: the stamps follow it"
-        return {"steps": self.steps, "step_s": f"{self.step_s:.3f}", "since_s": since_s, "_words": words}
+        return {"steps": self.steps, "_words": self._words}
 
 
 def log_time() -> RobotClock:

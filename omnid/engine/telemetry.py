@@ -17,12 +17,7 @@ RECENT: Final = 1000  # durations whose distribution is known: ten seconds of th
 
 
 class Histogram:
-    """Distribution of the newest durations, their number, and the longest of all.
-
-    One thread adds; any thread may read at the same time.
-    """
-
-    __slots__ = ("_recent_s", "count", "max_s")
+    """Distribution of the newest durations [s], their number, and the longest of all; one thread adds, any reads."""
 
     def __init__(self) -> None:
         self._recent_s: deque[float] = deque(maxlen=RECENT)
@@ -73,18 +68,14 @@ class StageStats:
 
     def timed(self, call: Callable[..., T], *args: Any) -> T:
         """Return `call(*args)`, counted and timed; a call that raises is not counted."""
-        start_ns, self.busy_since_ns = time.perf_counter_ns(), time.monotonic_ns()
+        start_ns = self.busy_since_ns = time.monotonic_ns()
         try:
             result = call(*args)
         finally:
             self.busy_since_ns = 0
-        self.add(start_ns)
-        return result
-
-    def add(self, start_ns: int) -> None:
-        """Count a message whose work began then, by time.perf_counter_ns()."""
-        self.wall.add((time.perf_counter_ns() - start_ns) * S_PER_NS)
+        self.wall.add((time.monotonic_ns() - start_ns) * S_PER_NS)
         self.processed += 1
+        return result
 
 
 class Telemetry:
@@ -103,15 +94,9 @@ class Telemetry:
         """Return the counters of a stage; StopIteration without it."""
         return next(stats for stats in self.stages if stats.name == name)
 
-    @property
-    def dropped_messages(self) -> int:
-        """Number of messages that were dropped in front of stages and sinks."""
-        return sum(stats.dropped for stats in self.stages if not stats.is_ticker)
-
-    @property
-    def missed_deadlines(self) -> int:
-        """Number of deadlines that tickers have missed."""
-        return sum(stats.dropped for stats in self.stages if stats.is_ticker)
+    def lost(self, *, by_tickers: bool) -> int:
+        """Return the number of messages that were dropped in front of stages and sinks, or of missed deadlines."""
+        return sum(stats.dropped for stats in self.stages if stats.is_ticker == by_tickers)
 
     def summary(self) -> list[SummaryRow]:
         """Return one row per stage, for printing."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import faulthandler
 import logging
+import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -14,40 +16,38 @@ from typing import Any, Final, Protocol, TypeAlias
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
+from drivers.cameras.log_camera import LogMotion
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.motion import MotionSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.ipc import ARMED, ControllerState
 from omnid.controller.link import DriveLink
-from omnid.core.control.arming import MANUAL, NO_ANSWER
+from omnid.core.control.arming import MANUAL
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
+from omnid.engine.graph import Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.logging_setup import Report
-from omnid.engine.realtime import ThreadStart, name_thread, prepare
-from omnid.engine.robot_clock import RobotClock, fixed_offset, log_time
+from omnid.engine.logging_setup import HANDLER, Report
+from omnid.engine.process import prepare, start_thread
+from omnid.engine.robot_clock import RobotClock, fixed_offset
 from omnid.engine.telemetry import Histogram
-from omnid.engine.threads import started
-from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.messages import SaveMap
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
 from omnid.runs.session import Session, joint_wheels, run_to_end
-from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
+from omnid.runs.systemd import Service, notify, period_s
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import PlannerDrive
 from omnid.sinks.encoder import StatusReport
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import ADVICE, controller_scan
 from omnid.transport import status_names as names
 from omnid.transport import topics
@@ -64,16 +64,6 @@ NO_MAP_FILE: Final = (
     "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
     "without --localize-only"
 )
-
-
-class MotionSource(Protocol):
-    """A source of samples of wheels and gyro, read by a thread of its own."""
-
-    def samples(self) -> Iterator[MotionSample]:
-        """Yield the samples until closed."""
-
-    def close(self) -> None:
-        """End samples(); from any thread."""
 
 
 class LiveCamera(FrameSource, Protocol):
@@ -120,7 +110,7 @@ class ConnectedRobot:
 
     waits: Final = False
 
-    def __init__(self, open_camera: OpenCamera, open_motion: Callable[[], MotionSource] | None = None) -> None:
+    def __init__(self, open_camera: OpenCamera, open_motion: Callable[[], LogMotion] | None = None) -> None:
         """open_motion: of wheels and gyro where the images are those of a log, called when the cameras were opened for
         the run; None: those of the robot.
         """
@@ -150,70 +140,55 @@ class ConnectedRobot:
         return {}
 
 
-class LiveRun:
-    """One run of the daemon."""
+def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None = None) -> RobotClock:
+    """Run the daemon until a signal comes, or the cameras end; return its clock. rig: None for that of the settings."""
+    with suppress(OSError, ValueError):  # stderr is no file
+        faulthandler.enable()  # the watchdog of systemd sends SIGABRT: the stacks of all threads are printed
 
-    def __init__(
-        self,
-        config: Config,
-        robot: LiveRobot,
-        report: Report,
-        rig: Rig | None = None,
-        show: Callable[[str], None] | None = None,
-    ) -> None:
-        """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
-        self._config, self._robot, self._report, self._rig, self._show = config, robot, report, rig, show
-        if robot.waits:  # its time waits for the stages, so that nothing is dropped
-            self._graph = Graph(policy=LOSSLESS, sinks_wait=True, on_thread=name_thread)
-        else:
-            priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
-            self._graph = Graph(policy=NEWEST, depth=1, on_thread=ThreadStart(priorities, report))
-        self.clock = log_time()  # that of the run, once it has begun
+    def warn(line: str) -> None:
+        was_asked = line == ARMED or names.DISARMED_BY_STOP in line
+        report(logging.INFO if was_asked else logging.WARNING, line)
 
-    def run(self) -> int:
-        """Run until a signal comes, or the cameras end; return the exit code."""
-        print_stacks_when_killed()
-        config, graph, robot = self._config, self._graph, self._robot
-
-        def warn(line: str) -> None:
-            was_asked = line == ARMED or names.DISARMED_BY_STOP in line
-            self._report(logging.INFO if was_asked else logging.WARNING, line)
-
-        self.clock = fixed_offset(robot.clock_ns) if robot.waits else RobotClock(robot.clock_ns, report=warn)
-        with ExitStack() as outputs:
-            session = Session(config, graph, outputs, warn, clock=self.clock)
-            # 1. The rig, and the compiled functions.
-            rig = self._rig or read_rig(Path(config.cameras.rig))
-            geometry = session.geometry(rig, ())
-            compile_serialisers(
-                [*(topic.schema for topic in topics.PUBLISHED.values()), *topics.command_topics(()).values()]
-            )
-            prepare_kernels()
-            outputs.enter_context(session.signals())
-            # 2. The connections, and the stages between them.
-            run_places = RunPlaces(config, geometry, warn)
-            _join(session, geometry, robot, self._report, run_places)
-            if (show := self._show) is not None:
-                line = StatusLine(session.statistics, graph.telemetry, robot.stats)
-                graph.ticker("terminal", 0.5, lambda: show(f"{line.statistics.length_m:8.2f} m  {line()}"))
-                outputs.callback(lambda: self._report(logging.INFO, line.summary()))
-                outputs.callback(show, "")
-                self._report(logging.INFO, _ready(config))
-            # 3. The run, until a signal or a failure ends it.
-            if not robot.waits and (refused := prepare(config.realtime)):
-                warn(refused)
-            # What the first loop needs is imported while the first poses are computed.
-            started(partial(import_module, "scipy.sparse.linalg"), "imports")
-            run_to_end(graph, run_places)
-        return 0
+    if robot.waits:  # its time waits for the stages, so that nothing is dropped
+        graph, clock = Graph(on_thread=partial(start_thread, {}, report)), fixed_offset(robot.clock_ns)
+    else:
+        priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
+        graph = Graph(drops=True, depth=1, on_thread=partial(start_thread, priorities, report))
+        clock = RobotClock(robot.clock_ns, report=warn)
+    with ExitStack() as outputs:
+        session = Session(config, graph, outputs, warn, clock)
+        # 1. The rig, and what is compiled or imported before the first image.
+        geometry = session.geometry(rig or read_rig(Path(config.cameras.rig)), ())
+        compile_serialisers(
+            [*(topic.schema for topic in topics.PUBLISHED.values()), *topics.command_topics(()).values()]
+        )
+        prepare_kernels()
+        import_module("scipy.sparse.linalg")  # what the first loop needs
+        outputs.enter_context(session.signals())
+        # 2. The connections, and the stages between them.
+        health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
+        run_places = _join(session, FrontEnd(geometry, config, health), robot, report)
+        # 3. The status line of systemd and of a terminal.
+        outputs.callback(HANDLER.show, "")
+        outputs.callback(notify, "STOPPING=1", "STATUS=stopping")
+        service = Service(graph.telemetry, session.statistics, config.service.stall_timeout_s, HANDLER.show)
+        session.every(period_s(), service, "watchdog")
+        # 4. The run, until a signal or a failure ends it.
+        if sys.stderr.isatty():
+            wheels = "`omnid arm` lets it drive; " if config.motor.port and config.controller.arming == MANUAL else ""
+            endpoints = ", ".join(config.bus.connect if config.bus.is_client else config.bus.listen)
+            report(logging.INFO, f"ready: poses at {endpoints} (`omnid listen`); {wheels}Ctrl-C ends")
+        if not robot.waits and (refused := prepare(config.realtime)):
+            warn(refused)
+        run_to_end(graph, run_places)
+    return clock
 
 
-def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report, run_places: RunPlaces) -> None:
-    """Connect robot, bus and files, wire the stages between them, and add what is done from time to time."""
-    config, graph, clock, warn = session.config, session.graph, session.clock, session.warn
-    rig, health = geometry.rig, RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
-    front_end = FrontEnd(geometry, config, health)
-    motion = front_end.pairing.motion
+def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Report) -> RunPlaces:
+    """Connect robot, bus and files, and wire the stages between them; return the map of places."""
+    config, graph, clock, statistics = session.config, session.graph, session.clock, session.statistics
+    geometry, health, motion = front_end.geometry, front_end.health, front_end.pairing.motion
+    rig = geometry.rig
 
     # 1. What is outside: cameras and wheels, the bus, the recording.
     frames, controller = robot.connect(session, motion.add)
@@ -221,8 +196,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     recorder = None
     if config.record.enabled:
         encode = session.encoder(rig, clock.segment_unix_ns)
-        images_hz = config.record.images_hz
-        recorder = open_recorder(config, rig_toml(rig), report, encode=encode, clock=clock, images_hz=images_hz)
+        recorder = open_recorder(config, rig_toml(rig), report, clock, encode, config.record.images_hz)
         session.outputs.callback(recorder.close)
 
     # 2. Who takes what the stages make.
@@ -231,7 +205,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     outputs = Outputs(
         pairs={"exposure": exposure},
         counters={
-            "statistics": session.statistics,
+            "statistics": statistics,
             "latency": lambda pose: to_pose.add((clock.monotonic_ns() - pose.stamp_ns) * S_PER_NS),
         },
         # The ticks of wheels that wait give the time.
@@ -246,79 +220,34 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         outputs.poses["rig"] = lambda pose: health.drive(
             pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure
         )
-    if controller is not None:
-        outputs.scans["controller-scan"] = lambda scan: controller.send(controller_scan(scan))
 
     # 3. The stages, and the navigation with its requests and files.
     requests, map_is_read = Requests(graph), graph.inlet(1)
     if rig.height_m(config.obstacles.scan.floor_m) is None:
-        warn(
+        session.warn(
             "the rig states no height of the cameras: the floor is looked for in the images; "
             f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
         )
-    if run_places.is_extended:
-        run_places.save_now_and_then(config.places.save_s, graph.inlet(topics.MOST_OPEN), bus.answer)
+    run_places = RunPlaces(config, geometry, session.warn, graph.inlet(topics.MOST_OPEN), bus.answer)
     navigation = None
     if controller is not None:
+        outputs.scans["controller-scan"] = lambda scan: controller.send(controller_scan(scan))
         states = controller.statistics.states = graph.inlet(1, thread="drive")
-        graph.sink("arming", ArmAnswers(bus), states, thread=states.thread)
+        graph.sink("arming", partial(_answer_arming, bus), states, thread=states.thread)
         if config.motion.wheels != "off" and not robot.brings_samples:
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         if PLANNER in config.controller.sources.names:
-            planner, folder = PlannerDrive(controller, bus.answer), RouteFolder(Path(config.navigation.routes))
-            navigation = Navigation(requests, states, folder, planner, bus.answer, config.places.map)
+            navigation = Navigation(requests, states, PlannerDrive(controller, bus.answer), bus.answer)
         else:
-            warn(NO_PLANNER)
+            session.warn(NO_PLANNER)
     inputs = Inputs(frames, run_places, controller, navigation, map_is_read, config.live.cloud_s)
     stages = wire(config, inputs, front_end, graph, outputs)
 
-    # 4. What comes from the bus, and the status of all parts.
-    watched = _subscribe(session, bus, robot, controller, requests, run_places, front_end)
-    statistics = session.statistics
-    watched |= {
-        names.IMAGES: lambda: image_stats(statistics.newest),
-        names.EXPOSURE: exposure.stats,
-        names.RIG: partial(rig_stats, health),
-        names.CLOCK: clock.stats,
-        names.BUS: bus.stats,
-    }
-    saver = run_places if run_places.requests else None
-    optional = {
-        names.PLACES: stages.places,
-        names.FLOOR: stages.floor,
-        names.RECORDING: recorder,
-        names.MAP_FILE: saver,
-        names.SIMULATION: robot if robot.stats() else None,
-    }
-    watched |= {name: part.stats for name, part in optional.items() if part is not None}
-    collect = StatusCollector(
-        graph.telemetry, robot.states, front_end.pairing, statistics, to_pose, watched, clock.monotonic_ns
-    )
-
-    def give_status() -> None:
-        map_is_read.push(recorder is not None or bus.is_received("cloud"))
-        reports.push(StatusReport(clock.monotonic_ns(), collect()))
-
-    graph.ticker("status", config.live.status_s, give_status)
-    service = Service(graph.telemetry, StatusLine(statistics, graph.telemetry), config.service.stall_timeout_s)
-    graph.ticker("watchdog", service.period_s, service)
-
-
-def _subscribe(
-    session: Session,
-    bus: Bus,
-    robot: LiveRobot,
-    controller: DriveLink | None,
-    requests: Requests,
-    run_places: RunPlaces,
-    front_end: FrontEnd,
-) -> dict[str, Callable[[], names.Stats]]:
-    """Begin to receive; without a motor all but samples and requests to save the map is refused. Return the numbers."""
-    config, clock, warn = session.config, session.clock, session.warn
+    # 4. What comes from the bus: samples of gyro and wheels, unless they come with the images of a log or of a
+    #    simulation, whose motion others would not fit; a motor controller gives those of its wheels. Commands and
+    #    requests; without a motor all but those to save the map are refused.
     sources, joints = config.controller.sources.names, joint_wheels(config)
-    # 1. Samples of gyro and wheels, unless they come with the images of a log or of a simulation, whose motion others
-    #    would not fit. A motor controller gives those of its wheels.
     used = {
         topics.IMU: config.motion.imu != "off",
         topics.JOINT_STATES if joints else topics.WHEEL_ODOM: config.motion.wheels != "off" and controller is None,
@@ -327,10 +256,9 @@ def _subscribe(
     def add_sample(topic: str, payload: bytes) -> None:
         sample = sample_from_cdr(payload, topics.command_of(topic).schema, clock.stamp_ns, joints)
         if sample is not None:
-            front_end.pairing.motion.add(sample)
+            motion.add(sample)
 
     sensors = {topic: partial(add_sample, topic) for topic in used if used[topic] and not robot.brings_samples}
-    # 2. Commands and requests.
     freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))
     bus.serve(topics.TIME, freshness.own_time)
 
@@ -349,16 +277,8 @@ def _subscribe(
         save_map=None if saves is None else lambda id: saves.push(SaveMap(id)),
         sensors=sensors,
         why_not=why_not,
-        report=warn,
+        report=session.warn,
     )
-    stats: dict[str, Callable[[], names.Stats]] = {
-        names.MOTION: lambda: front_end.motion_stats() | names.by_reason(names.REFUSED_PREFIX, commands.samples.refused)
-    }
-    if controller is not None:
-        stats |= {
-            names.WHEELS: partial(wheel_stats, controller.statistics, commands),
-            names.REQUESTS: commands.requests.stats,
-        }
 
     def receive(request: Request) -> None:
         if (answer := commands.receive(request)) is not None:
@@ -368,33 +288,42 @@ def _subscribe(
         return controller is not None and controller.statistics.state.disarmed_by == names.DISARMED_BY_STOP
 
     bus.subscribe_commands(receive, taken, is_stopped)
-    return stats
+
+    # 5. The status of all parts.
+    parts: dict[str, Callable[[], names.Stats] | None] = {
+        names.MOTION: lambda: (
+            front_end.motion_stats() | names.by_reason(names.REFUSED_PREFIX, commands.samples.refused)
+        ),
+        names.WHEELS: partial(wheel_stats, controller.statistics, commands) if controller else None,
+        names.REQUESTS: commands.requests.stats if controller else None,
+        names.IMAGES: lambda: image_stats(statistics.newest),
+        names.EXPOSURE: exposure.stats,
+        names.RIG: partial(rig_stats, health),
+        names.CLOCK: clock.stats,
+        names.BUS: bus.stats,
+        names.PLACES: stages.places.stats if stages.places else None,
+        names.FLOOR: stages.floor.stats if stages.floor else None,
+        names.RECORDING: recorder.stats if recorder else None,
+        names.MAP_FILE: run_places.stats if saves else None,
+        names.SIMULATION: robot.stats if robot.stats() else None,
+    }
+    watched = {name: stats for name, stats in parts.items() if stats is not None}
+    collect = StatusCollector(
+        graph.telemetry, robot.states, front_end.pairing, statistics, to_pose, watched, clock.monotonic_ns
+    )
+
+    def give_status() -> None:
+        map_is_read.push(recorder is not None or bus.is_received("cloud"))
+        reports.push(StatusReport(clock.monotonic_ns(), collect()))
+
+    session.every(config.live.status_s, give_status, "status")
+    return run_places
 
 
-class ArmAnswers:
-    """A sink of the controller's states that gives its answers; of several requests at once it answers the newest."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus, self._given = bus, NO_ANSWER
-
-    def process(self, state: ControllerState) -> None:
-        """Give the answer of a state, if it is a new one."""
-        answer, before = state.arm_answer, self._given
-        self._given = answer
-        if answer == before:
-            return
-        text = answer.refusal or "armed: it obeys commands from now on"
-        if answer.refusal == AWAITED:
-            text = f"{AWAITED}: {state.problem}"
-        self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=topics.ARM)
-
-
-def _ready(config: Config) -> str:
-    """Return what to do now that the run is ready."""
-    endpoints = ", ".join(config.bus.connect if config.bus.is_client else config.bus.listen)
-    wheels = ""
-    if not config.motor.port:
-        wheels = "; no motor"
-    elif config.controller.arming == MANUAL:
-        wheels = "; the wheels turn after `omnid arm`"
-    return f"ready: poses of {config.bus.robot!r} at {endpoints or 'no endpoint'} (`omnid listen`){wheels}; Ctrl-C ends"
+def _answer_arming(bus: Bus, state: ControllerState) -> None:
+    """Answer the newest request to arm, and those before it, which happens once."""
+    answer = state.arm_answer
+    text = answer.refusal or "armed: it obeys commands from now on"
+    if answer.refusal == AWAITED:
+        text = f"{AWAITED}: {state.problem}"
+    bus.answer(answer.id, Answer(not answer.refusal, text), also_before=topics.ARM)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from drivers.errors import EventCallback
 from drivers.frame import Camera, FrameSource
 from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
-from omnid.engine.graph import NEWEST, Graph
+from omnid.engine.graph import Graph
+from omnid.engine.logging_setup import Report
 from omnid.engine.process import handle_stop_signals
 from omnid.engine.robot_clock import RobotClock
+from omnid.engine.threads import Poller
 from omnid.runs.wiring import RECORDED_DEPTH
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
@@ -23,13 +25,7 @@ PERIOD_S: Final = 15.0  # Time between two lines about the progress.
 
 
 def open_recorder(
-    config: Config,
-    rig: str,
-    report: EventCallback,
-    *,
-    encode: Encoder | None = None,
-    clock: RobotClock | None = None,
-    images_hz: float = 0.0,
+    config: Config, rig: str, report: Report, clock: RobotClock, encode: Encoder | None = None, images_hz: float = 0.0
 ) -> Recorder:
     """Return a recorder to the folder of the configuration; the first message makes the first file.
 
@@ -42,34 +38,25 @@ def open_recorder(
     return Recorder(log, config.bus.robot, encode, clock=clock, skip_invalid=True, images_hz=images_hz)
 
 
-def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: EventCallback) -> Recorder:
+def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: Report) -> Recorder:
     """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
     clock = RobotClock(report=lambda line: report(logging.WARNING, line))
-    recorder = open_recorder(config, rig, report, clock=clock)
-    graph = Graph(policy=NEWEST, depth=RECORDED_DEPTH)
+    graph = Graph(drops=True, depth=RECORDED_DEPTH)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
+    recorder = open_recorder(config, rig, report, clock)
     graph.sink("record", recorder, *frames)
 
     def report_progress() -> None:
-        if recorder.state.files:
-            report(logging.INFO, progress_line(recorder, graph))
+        state, dropped = recorder.state, graph.telemetry.of("record").dropped
+        written = state.messages - state.lost
+        report(
+            logging.INFO if written else logging.WARNING,
+            f"recording: {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
+            f"refused {recorder.invalid}, oldest files deleted {state.deleted}, {state.status}",
+        )
 
-    graph.ticker("progress", PERIOD_S, report_progress)
-    try:
-        with handle_stop_signals(lambda *_: graph.stop()):  # a second signal ends it at once
-            graph.run()
-    finally:
-        recorder.close()
-    report(logging.INFO if recorder.state.messages else logging.WARNING, progress_line(recorder, graph))
+    poller = Poller(report_progress, PERIOD_S, "progress")
+    with closing(recorder), closing(poller), handle_stop_signals(lambda *_: graph.stop()):
+        graph.run()
+    report_progress()
     return recorder
-
-
-def progress_line(recorder: Recorder, graph: Graph) -> str:
-    """Return one line with the counts of the recording."""
-    state = recorder.state
-    dropped = sum(stage.dropped for stage in graph.telemetry.stages if stage.name == "record")
-    written = state.messages - state.lost
-    return (
-        f"recording: {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
-        f"refused {recorder.invalid}, oldest files deleted {state.deleted}, {state.status}"
-    )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from os import PathLike
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,21 +23,24 @@ from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE
+from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings, pair_loss
 from omnid.diagnostics.status import stage_stats, summary_stats
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink
+from omnid.engine.graph import Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.realtime import RealtimeSettings
-from omnid.engine.telemetry import Telemetry
+from omnid.engine.process import RealtimeSettings
+from omnid.engine.telemetry import SummaryRow, Telemetry
 from omnid.engine.threads import POLL_S, sleep_until
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
+from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
+from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.place_maps import RunPlaces
-from omnid.runs.run_result import RunResult
 from omnid.runs.session import Session, attached_rig, motion_topics, run_to_end
-from omnid.runs.wiring import Inputs, Outputs, wire
+from omnid.runs.wiring import Inputs, Outputs, WiredStages, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
@@ -44,12 +48,9 @@ from omnid.sinks.encoder import Outgoing, StatusReport
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import Geometry
-from omnid.tracking_state import TrackingState
-from omnid.transport.codec import DiagnosticStatus
+from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.status_names import MOTION, SUMMARY, entry, stage_name
 
-Array = NDArray[np.float64]
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 
@@ -85,235 +86,258 @@ class ReplayOptions:
         return [(f"--{name.replace('_', '-')}", path) for name in names if (path := getattr(self, name)) is not None]
 
 
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RunResult:
+    """Poses, map, counters, timings and warnings of a run.
+
+    Poses are T_odom_rig: they map points of the rig frame into odom, which is the rig frame of the first pair
+    (p_odom = T_odom_rig @ p_rig; x forward, y left, z up; m). There is one pose for every pair of images, its stamp is
+    that of the lower camera's image. Without collection (ReplayOptions.collect) the arrays are empty and the map is
+    None; counters, timings and warnings are always there.
+    """
+
+    stamps_ns: NDArray[np.int64]  # (N,) as in the log: ns of Unix time
+    T_odom_rig: NDArray[np.float64]  # (N, 4, 4)
+    covariances: NDArray[np.float64]  # (N, 6, 6) of the poses, [t; r] in the axes of the rig, m^2 and rad^2
+    states: tuple[TrackingState, ...]  # (N,)
+    counters: RunCounters
+    timings: Mapping[str, SummaryRow]  # by stage: messages, drops, p50, p99 and maximum of the time of one [ms]
+    warnings: tuple[str, ...]  # doubts about the input and what to do about them, one line each
+    map: MapPoints | None  # points (M, 3) m in odom, with confidence, frames and age; None without a pair
+    signal: int = 0  # number of the signal that ended the run early; 0: it came to its end
+    # Poses in the map: by the map at the end, and as known while driving (live) with the states then. Empty if places
+    # are not recognised.
+    T_map_rig: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
+    T_map_rig_live: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
+    map_states: tuple[MapState, ...] = ()  # (N,)
+    places: PlaceMap | None = None  # keyframes by which the places are recognised; None as above
+    map_file: Path | None = None  # of places, where the run has written one
+    elapsed_s: float = 0.0  # time that the stages took, without the start
+
+    def __repr__(self) -> str:
+        """Return one line: poses, length and warnings."""
+        found = self.counters
+        return f"<RunResult: {found.poses} poses, {found.length_m:.2f} m, {len(self.warnings)} warnings>"
+
+    def evaluate(
+        self, truth: str | PathLike[str] | Trajectory, *, tolerance_s: float = 0.01, alignment: str = "origin"
+    ) -> Metrics:
+        """Return the errors of the poses against a true trajectory, as `omnid eval` prints them.
+
+        truth: a TUM file, or a Trajectory of T_world_rig. tolerance_s: largest difference of the stamps of two poses.
+        alignment: "origin" (the first poses coincide), "rigid" or "scale" (all positions do, least squares).
+
+        Raises OmnidError for a file that cannot be read and for fewer than two poses at the same times.
+        """
+        true = truth if isinstance(truth, Trajectory) else read_tum(Path(truth))
+        return evaluate(Trajectory(self.stamps_ns, self.T_odom_rig), true, tolerance_s, alignment)
+
+    def save_tum(self, path: str | PathLike[str]) -> None:
+        """Write the trajectory: a row `t x y z qx qy qz qw` for each pose (s, m, unit quaternion).
+
+        Raises OmnidError where the poses were not collected or the file cannot be written.
+        """
+        if len(self.stamps_ns) < self.counters.poses:
+            raise OmnidError(f"{path}: the poses of this run were not collected: run it with collect=True")
+        write_trajectory(Path(path), self.stamps_ns, self.T_odom_rig)
+
+    def save_ply(self, path: str | PathLike[str]) -> None:
+        """Write the map as a binary PLY file: x y z [m], confidence, frames and age of every point.
+
+        Raises OmnidError where there is no map or the file cannot be written.
+        """
+        if self.map is None:
+            raise OmnidError(f"{path}: this run has no map: it found no pair of images, or it did not collect")
+        write_ply(Path(path), self.map)
+
+
 def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> RunResult:
     """Run a log (an MCAP file or a folder of them) through the stages and return the result.
 
     Prints nothing. A first SIGINT, SIGTERM or SIGHUP ends the run early with whole files and `signal` in the result;
-    a second one raises KeyboardInterrupt. Raises OmnidError, DriverError or CalibError for wrong input and outputs that
-    cannot be written.
+    inline, a second one raises KeyboardInterrupt. Raises OmnidError, DriverError or CalibError for wrong input and
+    outputs that cannot be written.
     """
-    return _Replay(log, config, options or ReplayOptions()).run()
+    options = options or ReplayOptions()
+    # 1. No output may be an input, or another output.
+    logs = [log, *sorted(log.glob("*.mcap"))]  # those of a folder also by another name
+    named = [*(("log", path) for path in logs), ("rig", options.rig), ("configuration", options.settings)]
+    check_outputs(options.files, [(f"the {what} that is read", path) for what, path in named if isinstance(path, Path)])
+    if (options.map_tum or options.map_live_tum) and not config.places.enabled:
+        raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
+    graph = Graph(drops=options.drops, threaded=not options.inline)
+    with ExitStack() as closing:
+        # 2. The log and its rig; compiling may take a minute, so that a log or a rig that is wrong is refused first.
+        warnings = list[str]()
+        session = Session(config, graph, closing, warnings.append)
+        given = read_rig(options.rig) if isinstance(options.rig, Path) else options.rig
+        reader = _opened(log, config, options, given)
+        closing.callback(reader.close)
+        geometry = session.geometry(given or attached_rig(reader, log), reader.frames())
+        prepare_kernels()
+        front_end = FrontEnd(geometry, config)
+        run_places = RunPlaces(config, geometry, session.warn)
 
-
-class _Replay:
-    def __init__(self, log: Path, config: Config, options: ReplayOptions) -> None:
-        self._log, self._config, self._options = log, config, options
-        # Stamp [ns], T_odom_rig, covariance and state of each pose: 0.7 kB, 75 MB an hour at 30 Hz.
-        self._poses: list[tuple[int, Array, Array, TrackingState]] = []
-        self._in_map: list[PlaceUpdate] = []
-        self._map: deque[MapUpdate] = deque(maxlen=1)  # the newest one
-        self._wheels: ReplayDrive | None = None
-        self._warnings: list[str] = []
-        self._begun_s = 0.0
-
-    def run(self) -> RunResult:
-        options, config = self._options, self._config
-        check_outputs(options.files, self._inputs())
-        in_map = [name for name, _ in options.files if name in ("--map-tum", "--map-live-tum")]
-        if in_map and not config.places.enabled:
-            raise OmnidError(f"{in_map[0]}: places.enabled = false, so that there is no pose in the map; leave one out")
-        graph = Graph(policy=NEWEST if options.drops else LOSSLESS, threaded=not options.inline)
-        with ExitStack() as outputs:
-            self._session = session = Session(config, graph, outputs, self._warnings.append)
-            # 1. The log and its rig.
-            self._reader = reader = self._opened()
-            outputs.callback(reader.close)
-            geometry = session.geometry(self._rig(), reader.frames())
-            prepare_kernels()  # may take a minute: after a log or a rig that is wrong was refused
-            self._front_end = front_end = FrontEnd(geometry, config)
-            # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
-            run_places = RunPlaces(config, geometry, session.warn)
-            messages, sinks = graph.source("read", self._messages()), self._outputs(geometry)
-            inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
-            self._stages = wire(config, inputs, front_end, graph, sinks)
-            if options.progress is not None:
-                show = partial(options.progress, session.statistics, reader.pair_estimate())
-                graph.ticker("progress", POLL_S, partial(show, False))
-                outputs.callback(show, True)
-            # 3. The run.
-            self._begun_s = time.monotonic()
-            with session.signals(self._on_signal):
-                run_to_end(graph, run_places)  # before the result is made: it may warn
-            self._end_recording(sinks.recorder)
-            return replace(self._result(), map_file=run_places.written)
-
-    def _inputs(self) -> list[tuple[str, Path]]:
-        """The files that are read, each with its name for errors."""
-        logs = [self._log, *sorted(self._log.glob("*.mcap"))]  # those of a folder also by another name
-        named = [*(("log", log) for log in logs), ("rig", self._options.rig), ("configuration", self._options.settings)]
-        return [(f"the {what} that is read", path) for what, path in named if isinstance(path, Path)]
-
-    def _opened(self) -> LogReader:
-        """Open the log; the topics are those of the options, else of the rig, else found by their names."""
-        lower, upper = self._options.topics
-        rig, log = self._options.rig, self._config.log
-        open_log = partial(
-            LogReader,
-            self._log,
-            span_s=self._options.span_s,
-            motion=motion_topics(self._config),
-            bits=self._config.cameras.bits,
-            rate_hz=log.rate_hz,
-            time=log.time,
-        )
-        if rig and not (lower and upper):
-            named = (read_rig(rig) if isinstance(rig, Path) else rig).topics
-            if all(named):
-                with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
-                    return open_log(lower or named[0], upper or named[1])
-        return open_log(lower, upper)
-
-    def _rig(self) -> Rig:
-        found = self._options.rig
-        if found is None:
-            return attached_rig(self._reader, self._log)
-        return read_rig(found) if isinstance(found, Path) else found
-
-    def _messages(self) -> Callable[[], Iterator[Frame | MotionSample]]:
-        """Return the source of the log; paced, each message comes when its stamp is due."""
-        messages, graph = self._reader.messages, self._session.graph
-        motion = self._front_end.pairing.motion
-
-        def paced() -> Iterator[Frame | MotionSample]:
-            offset_ns: int | None = None
-            for message in messages():
-                if offset_ns is None:
-                    offset_ns = time.monotonic_ns() - message.stamp_ns
-                sleep_until(message.stamp_ns + offset_ns, lambda: graph.is_stopping)
-                if isinstance(message, Frame):
-                    yield message
-                else:  # in the inbox of the pairing samples would replace frames
-                    motion.add(message)
-
-        return paced if self._options.paced else messages
-
-    def _outputs(self, geometry: Geometry) -> Outputs:
-        """Open all outputs."""
-        options, config, session = self._options, self._config, self._session
+        # 3. The outputs; one that cannot be opened ends the run before it begins. A pose that is kept, with its
+        #    covariance, takes 0.7 kB: 75 MB an hour at 30 Hz.
+        poses = list[tuple[int, NDArray[np.float64], NDArray[np.float64], TrackingState]]()
+        updates, newest_map = list[PlaceUpdate](), deque[MapUpdate](maxlen=1)
+        rig = geometry.rig
+        recorder: Recorder | None = None
+        wheels: ReplayDrive | None = None
+        bus: BusSink | None = None
         outputs = Outputs(counters={"statistics": session.statistics})
         if options.collect:
-            outputs.poses["collect-poses"] = lambda pose: self._poses.append(
+            outputs.poses["collect-poses"] = lambda pose: poses.append(
                 (pose.stamp_ns, pose.T_odom_rig, pose.covariance, TrackingState(pose.state))
             )
-            outputs.maps["collect-map"] = self._map.append
+            outputs.maps["collect-map"] = newest_map.append
         if options.tum:
             outputs.poses["trajectory"] = TrajectoryFile(options.tum)
         if options.map_tum or options.map_live_tum or options.collect:
-            outputs.places["collect-places"] = self._in_map.append
+            outputs.places["collect-places"] = updates.append
         if cloud := options.cloud:  # each map replaces the file
             outputs.maps["map"] = lambda update: write_ply(cloud, update.points)
         if plan := options.plan:
-            heights_m = drawn_heights(geometry.rig.height_m(config.obstacles.scan.floor_m) or 0.0)
+            heights_m = drawn_heights(rig.height_m(config.obstacles.scan.floor_m) or 0.0)
             outputs.maps["plan"] = lambda update: write_plan(plan, update.points, update.path_xy, heights_m)
-        recorder: Sink[Any] | None = None
-        if options.observer:
-            recorder = options.observer(self._front_end, session.graph.telemetry)
         if options.record:
-            attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
-            log = SingleLog(options.record, attachments)
-            recorder = Recorder(log, config.bus.robot, session.encoder(geometry.rig))
-            session.outputs.callback(recorder.close)
+            attachments = {"rig.toml": rig_toml(rig).encode(), "omnid.toml": dump(config).encode()}
+            recorder = Recorder(SingleLog(options.record, attachments), config.bus.robot, session.encoder(rig))
+            closing.callback(recorder.close)
         if config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
-            setpoint = config.controller.setpoint.setpoint()
-            health, T_base_rig = self._front_end.health, geometry.rig.T_base_rig
-            outputs.counters["controller"] = self._wheels = ReplayDrive(controller, setpoint, T_base_rig, health)
-        bus: BusSink | None = None
+            wheels = ReplayDrive(controller, config.controller.setpoint.setpoint(), rig.T_base_rig, front_end.health)
+            outputs.counters["controller"] = wheels
         if options.publish:
-            encode = session.encoder(geometry.rig)
-            bus = BusSink(session.open_bus(geometry.rig, gives_time=True), encode, clock=OdometryUpdate)
-        return replace(outputs, bus=bus, recorder=recorder)
+            bus = BusSink(session.open_bus(rig, gives_time=True), session.encoder(rig), clock=OdometryUpdate)
+        observer = options.observer(front_end, graph.telemetry) if options.observer else recorder
+        outputs = replace(outputs, bus=bus, recorder=observer)
+        messages = graph.source("read", _paced(reader, graph, front_end) if options.paced else reader.messages)
+        inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
+        stages = wire(config, inputs, front_end, graph, outputs)
+        if options.progress is not None:
+            show = partial(options.progress, session.statistics, reader.pair_estimate())
+            closing.callback(show, True)
+            session.every(POLL_S, partial(show, False), "progress")
 
-    def _on_signal(self, again: bool) -> None:
-        if again and self._options.inline:  # nothing else interrupts the stage that runs in this thread
-            raise KeyboardInterrupt
-
-    def _counters(self) -> RunCounters:
-        """Return the counters of the run; all that was lost, by reason, zeros too."""
-        found, read, paired = self._session.statistics, self._reader.counts, self._front_end.pairing.counts
-        drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
-        drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
-        drops["broken"] += paired["broken"]
-        drops["queue"] = self._session.graph.telemetry.dropped_messages
-        mapping, places = self._stages.mapping, self._stages.places
-        return RunCounters(
-            paired["pairs"],
-            found.poses,
-            found.length_m,
-            {state: found.states[state] for state in TrackingState},
-            found.resets,
-            drops,
-            {} if mapping is None else mapping.counts,
-            {} if places is None else places.counts,
-            {} if self._wheels is None else self._wheels.counts(),
-            "" if drops["queue"] else pair_loss(self._front_end.pairing, read),  # else they were dropped on purpose
-        )
-
-    def _about_input(self, counters: RunCounters) -> Iterator[str]:
-        """Yield warnings about the log and the images."""
-        odometry, floor = self._front_end.odometry, self._stages.floor
-        yield from self._reader.warnings
-        if counters.loss:
-            yield counters.loss
-        if not counters.poses and self._session.signal:
-            return
-        fault = odometry.last_fault
-        if fault.reason:
-            yield f"{fault.reason} {fault.detail}; {ADVICE}"
-        message = "".join(status.message for status in self._motion())
-        if message and not (fault.reason and message.startswith(fault.reason)):
-            yield f"wheels and gyro: {message}"
-        if floor is not None and floor.summary():
-            yield floor.summary()
-        yield from odometry.image_faults
-        yield from input_warnings(
-            self._front_end.pairing, self._front_end.health, self._session.statistics, self._config
-        )
-
-    def _motion(self) -> list[DiagnosticStatus]:
-        """Return the entry of wheels and gyro, if there were any."""
-        inbox = self._front_end.pairing.motion
-        return [entry(MOTION, self._front_end.motion_stats())] if inbox.wheels or inbox.gyro else []
-
-    def _end_recording(self, recorder: object) -> None:
-        """Complete a recording with the counters of the run and of its stages, if it has messages."""
-        if isinstance(recorder, Recorder) and recorder.state.messages:
-            stages = self._session.graph.telemetry.stages
-            found = [entry(stage_name(stage.name), stage_stats(stage)) for stage in stages]
-            summary = replace(self._counters(), motor={})
-            statuses = [entry(SUMMARY, summary_stats(summary)), *self._motion(), *found]
+        # 4. The run, and what it has counted.
+        begun_s = time.monotonic()
+        with session.signals():
+            run_to_end(graph, run_places)
+        counters = _counters(session, reader, front_end, stages, wheels)
+        if recorder is not None and recorder.state.messages:
+            statuses = [entry(stage_name(stage.name), stage_stats(stage)) for stage in graph.telemetry.stages]
+            if front_end.pairing.motion.wheels or front_end.pairing.motion.gyro:
+                statuses.insert(0, entry(MOTION, front_end.motion_stats()))
+            statuses.insert(0, entry(SUMMARY, summary_stats(replace(counters, motor={}))))
             recorder.process(StatusReport(recorder.newest_ns, statuses))
             recorder.close()
 
-    def _result(self) -> RunResult:
-        options, places, updates, session = self._options, self._stages.places, self._in_map, self._session
-        # 1. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
+        # 5. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
+        places = stages.places
         found = [] if places is None else [places.corrected(each) for each in updates]
         known = np.zeros(0, bool) if places is None else places.known(updates)
         in_map, live = (np.array(T, float).reshape(-1, 4, 4) for T in (found, [each.T_map_rig for each in updates]))
         stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
-        if path := options.map_tum:
-            self._warnings += write_trajectory(path, stamps_ns, in_map, known)
-        if path := options.map_live_tum:
-            known_live = np.array([each.is_known for each in updates], bool)
-            self._warnings += write_trajectory(path, stamps_ns, live, known_live)
-        # 2. All that was found.
-        counters = self._counters()
-        collected = zip(*self._poses, strict=True) if self._poses else ((), (), (), ())
-        pose_stamps_ns, poses, covariances, states = collected
+        if options.map_tum:
+            warnings += write_trajectory(options.map_tum, stamps_ns, in_map, known)
+        if options.map_live_tum:
+            known = np.array([each.is_known for each in updates], bool)
+            warnings += write_trajectory(options.map_live_tum, stamps_ns, live, known)
         return RunResult(
-            np.array(pose_stamps_ns, np.int64),
-            np.array(poses, np.float64).reshape(-1, 4, 4),
-            np.array(covariances, np.float64).reshape(-1, 6, 6),
-            tuple(states),
+            np.array([pose[0] for pose in poses], np.int64),
+            np.array([pose[1] for pose in poses], np.float64).reshape(-1, 4, 4),
+            np.array([pose[2] for pose in poses], np.float64).reshape(-1, 6, 6),
+            tuple(pose[3] for pose in poses),
             counters,
-            {row.stage: row for row in session.graph.telemetry.summary()},
-            (*dict.fromkeys(self._warnings), *self._about_input(counters)),
-            self._map[0].points if self._map else None,
+            {row.stage: row for row in graph.telemetry.summary()},
+            (*dict.fromkeys(warnings), *_about_input(session, reader, front_end, stages, counters)),
+            newest_map[0].points if newest_map else None,
             session.signal,
             in_map,
             live,
             tuple(each.state for each in updates),
             places.map() if places is not None and options.collect else None,
-            elapsed_s=time.monotonic() - self._begun_s,
+            run_places.written,
+            time.monotonic() - begun_s,
         )
+
+
+def _opened(log: Path, config: Config, options: ReplayOptions, rig: Rig | None) -> LogReader:
+    """Open the log; the topics are those of the options, else of the rig, else found by their names."""
+    lower, upper = options.topics
+    open_log = partial(
+        LogReader,
+        log,
+        span_s=options.span_s,
+        motion=motion_topics(config),
+        bits=config.cameras.bits,
+        rate_hz=config.log.rate_hz,
+        time=config.log.time,
+    )
+    if rig and not (lower and upper) and all(rig.topics):
+        with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
+            return open_log(lower or rig.topics[0], upper or rig.topics[1])
+    return open_log(lower, upper)
+
+
+def _paced(reader: LogReader, graph: Graph, front_end: FrontEnd) -> Callable[[], Iterator[Frame]]:
+    """Return a source of the log's frames, each of which comes when its stamp is due."""
+
+    def messages() -> Iterator[Frame]:
+        offset_ns: int | None = None
+        for message in reader.messages():
+            if offset_ns is None:
+                offset_ns = time.monotonic_ns() - message.stamp_ns
+            sleep_until(message.stamp_ns + offset_ns, lambda: graph.is_stopping)
+            if isinstance(message, MotionSample):  # in the inbox of the pairing samples would replace frames
+                front_end.pairing.motion.add(message)
+            else:
+                yield message
+
+    return messages
+
+
+def _counters(
+    session: Session, reader: LogReader, front_end: FrontEnd, stages: WiredStages, wheels: ReplayDrive | None
+) -> RunCounters:
+    """Return the counters of the run; all that was lost, by reason, zeros too."""
+    found, read, paired = session.statistics, reader.counts, front_end.pairing.counts
+    drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
+    drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
+    drops["broken"] += paired["broken"]
+    drops["queue"] = session.graph.telemetry.lost(by_tickers=False)
+    return RunCounters(
+        paired["pairs"],
+        found.poses,
+        found.length_m,
+        {state: found.states[state] for state in TrackingState},
+        found.resets,
+        drops,
+        {} if stages.mapping is None else stages.mapping.counts,
+        {} if stages.places is None else stages.places.counts,
+        {} if wheels is None else wheels.counts(),
+        "" if drops["queue"] else pair_loss(front_end.pairing, read),  # else they were dropped on purpose
+    )
+
+
+def _about_input(
+    session: Session, reader: LogReader, front_end: FrontEnd, stages: WiredStages, counters: RunCounters
+) -> Iterator[str]:
+    """Yield warnings about the log and the images."""
+    yield from reader.warnings
+    if counters.loss:
+        yield counters.loss
+    if not counters.poses and session.signal:
+        return
+    fault, motion = front_end.odometry.last_fault, front_end.pairing.motion
+    if fault.reason:
+        yield f"{fault.reason} {fault.detail}; {ADVICE}"
+    message = entry(MOTION, front_end.motion_stats()).message if motion.wheels or motion.gyro else ""
+    if message and not (fault.reason and message.startswith(fault.reason)):
+        yield f"wheels and gyro: {message}"
+    if stages.floor is not None and stages.floor.summary():
+        yield stages.floor.summary()
+    yield from front_end.odometry.image_faults
+    yield from input_warnings(front_end.pairing, front_end.health, session.statistics, session.config)

@@ -1,10 +1,9 @@
-"""The parts that live runs and replays share: graph, statistics, geometry, bus, encoders, and signals."""
+"""The parts that live runs and replays share: statistics, geometry, bus, controller, encoders, and signals."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, ExitStack, suppress
 from types import FrameType
 from typing import Final
 
@@ -22,12 +21,11 @@ from omnid.controller.ipc import ControllerStart
 from omnid.controller.link import ControllerLink
 from omnid.core.control.control_law import ControllerSettings
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.graph import Graph, nothing
-from omnid.engine.process import handle_stop_signals
-from omnid.engine.realtime import RealtimeSettings
+from omnid.engine.graph import Graph
+from omnid.engine.process import RealtimeSettings, handle_stop_signals
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.engine.telemetry import StageStats
-from omnid.engine.threads import started
+from omnid.engine.threads import Poller, started
 from omnid.errors import OmnidError
 from omnid.runs.place_maps import RunPlaces
 from omnid.settings import dump
@@ -39,7 +37,7 @@ BUS_S: Final = 3.0  # Time until a bus must be closed.
 CLOUD_POINTS: Final = 50_000  # Most points of the map, the most confident ones, in one message.
 
 
-def attached_rig(reader: LogReader, log: Path) -> Rig:
+def attached_rig(reader: LogReader, log: object) -> Rig:
     """Return the rig of the rig.toml that is attached to the log; OmnidError if there is none."""
     attached = reader.attachments().get("rig.toml")
     if attached is None:
@@ -69,10 +67,7 @@ def joint_wheels(config: Config) -> JointWheels | None:
 
 
 def run_to_end(graph: Graph, run_places: RunPlaces) -> None:
-    """Run until the end, then complete the map of places.
-
-    A run that fails completes it as well: the error that ended the run is the one that is raised.
-    """
+    """Run until the end, then complete the map of places, also after a failure, which is the error that is raised."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)  # the stages are threads themselves
     try:
@@ -95,7 +90,6 @@ class Session:
         graph: Graph,
         outputs: ExitStack,
         warn: Callable[[str], None],
-        *,
         clock: RobotClock | None = None,
     ) -> None:
         """warn: takes a line for the user; clock: that of the stamps of the frames, None: they are Unix time."""
@@ -115,24 +109,29 @@ class Session:
                 )
         return geometry(rig, self.config.panorama)
 
+    def every(self, period_s: float, action: Callable[[], object], name: str) -> None:
+        """Call an action each period, in a thread of its own, until the outputs are closed."""
+        self.outputs.callback(Poller(action, period_s, name).close)
+
     def open_bus(self, rig: Rig, *, gives_time: bool) -> Bus:
         """Open the bus; it answers queries for the configuration and the rig. gives_time: as Bus has it."""
         bus = Bus(self.config.bus, self.warn, gives_time=gives_time)
-        self.outputs.callback(self._close_bus, bus)
+
+        def close() -> None:
+            closing = started(bus.close, "bus-close")
+            closing.join(BUS_S)  # zenoh waits for subscribers that do not read, for 10 s; a service has less time
+            if closing.is_alive():
+                self.warn(f"the bus has not closed within {BUS_S:g} s: a subscriber does not read")
+
+        self.outputs.callback(close)
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         return bus
-
-    def _close_bus(self, bus: Bus) -> None:
-        """Close the bus. zenoh waits for subscribers that do not read, for 10 s and more; a service has less time."""
-        if not started(bus.close, "bus-close")(BUS_S):
-            self.warn(f"the bus has not closed within {BUS_S:g} s, for a subscriber does not read: it is given up")
 
     def start_controller(self, realtime: RealtimeSettings, *, of_replay: bool = False) -> ControllerLink:
         """Start the controller process; DriverError where its settings cannot be used.
 
         A live run waits for its motor controller as for its cameras, while a replay needs it at once: DriverError.
-
         The wheels stop, and the process ends, at the latest with `outputs`.
         """
         settings = self.config.controller.of_replay if of_replay else self.config.controller
@@ -145,10 +144,7 @@ class Session:
         """Return the settings, without the collision monitor where no obstacles are searched, which is reported."""
         if not settings.collision.check or self.config.obstacles.enabled:
             return settings
-        self.warn(
-            "obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving against "
-            "obstacles"
-        )
+        self.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from obstacles")
         return settings.without_obstacles
 
     def encoder(self, rig: Rig, unix_ns: UnixTime | None = None) -> Encoder:
@@ -156,20 +152,16 @@ class Session:
         scan_range_m = self.config.obstacles.scan.max_range_m
         return Encoder(rig.T_base_rig, CLOUD_POINTS, unix_ns or self.clock.unix_ns, rig, scan_range_m)
 
-    @contextmanager
-    def signals(self, on_signal: Callable[[bool], None] = nothing) -> Iterator[None]:
-        """Stop the graph on SIGINT, SIGTERM and SIGHUP in this block, a second signal stops it at once.
+    def signals(self) -> AbstractContextManager[None]:
+        """Return a context in which SIGINT, SIGTERM and SIGHUP stop the graph.
 
-        on_signal: called in the handler; True: it is the second signal or a later one.
-        Outside the main thread, where Python has no signal handlers, the block leaves signals as they are.
+        Inline, where nothing else interrupts the stage that runs in this thread, a second one raises KeyboardInterrupt.
         """
 
         def handle(number: int, _: FrameType | None) -> None:
             again, self.signal = self.signal != 0, number
             self.graph.stop()
-            on_signal(again)
+            if again and not self.graph.threaded:
+                raise KeyboardInterrupt
 
-        with ExitStack() as handlers:
-            with suppress(ValueError):
-                handlers.enter_context(handle_stop_signals(handle))
-            yield
+        return handle_stop_signals(handle)

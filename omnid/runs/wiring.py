@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from drivers.frame import Frame
 from drivers.motion import MotionSample
-from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.ipc import ControllerState
 from omnid.controller.link import DriveLink
 from omnid.core.navigation.situation import WheelState
-from omnid.engine.graph import NEWEST, Graph, Output, Stream
+from omnid.engine.graph import Graph, Output, Stream
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
@@ -36,10 +36,8 @@ class Navigation(NamedTuple):
 
     requests: Requests
     states: Stream[ControllerState]  # of the controller; an inlet of the thread that gives the commands
-    routes: RouteFolder
     drive: Output[NavigationUpdate]
     answer: Callable[[int, Answer], object]  # takes the id of a request whose route was written
-    map_name: str  # of the file of the map; empty: it is not saved
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +56,9 @@ class Inputs:
 class Outputs:
     """The consumers of a run; a map that none of them takes is not computed, nor are places."""
 
-    pairs: dict[str, Output[FramePair]] = field(default_factory=dict)  # each takes the newest
+    pairs: dict[str, Output[FramePair]] = field(default_factory=dict)
     poses: dict[str, Output[OdometryUpdate]] = field(default_factory=dict)
     counters: dict[str, Output[OdometryUpdate]] = field(default_factory=dict)  # in the thread of the poses: never wait
-    commands: dict[str, Output[VelocityCommand]] = field(default_factory=dict)
     maps: dict[str, Output[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Output[PlaceUpdate]] = field(default_factory=dict)
     scans: dict[str, Output[ObstacleScan]] = field(default_factory=dict)  # in the thread of the scans
@@ -82,7 +79,7 @@ class WiredStages(NamedTuple):
 def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outputs: Outputs) -> WiredStages:
     """Join the stages to the inputs and to the outputs; return those that are asked for counts.
 
-    Live (policy NEWEST), one thread makes a pose of the newest images, so that what is old is dropped before any work.
+    Where inboxes drop, one thread makes a pose of the newest images, so that what is old is dropped before any work.
     Else decoding and dewarping are one bounded inbox ahead of the odometry. Places, obstacles and navigation have a
     thread each. What no wheel waits for shares one: the map, what draws or encodes it, and sinks that write.
     """
@@ -90,6 +87,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     T_base_rig = geometry.rig.T_base_rig
     T_base_rect = T_base_rig @ geometry.T_rig_rect
     known_places = None if run_map is None else run_map.places
+    routes = RouteFolder(Path(config.navigation.routes))
     takes_all = outputs.bus is not None or outputs.recorder is not None
     mapping, places, obstacles = None, None, None
     maps, in_map, grids, scans, written, ways = None, None, None, None, None, None
@@ -97,7 +95,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *inputs.frames)
     panoramas = graph.stage("dewarp", front_end.dewarp, pairs, thread="pair")
-    poses = graph.stage("odometry", front_end.odometry, panoramas, thread="pair" if graph.policy is NEWEST else "")
+    poses = graph.stage("odometry", front_end.odometry, panoramas, thread="pair" if graph.drops else "")
 
     # 2. Poses go to the controller, which waits for no stage.
     if inputs.controller is not None:
@@ -113,7 +111,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         noted = () if inputs.map_is_read is None else (inputs.map_is_read,)
         maps = graph.stage("mapping", mapping, poses, *noted, thread=BACKGROUND)
     if navigation is not None:  # requests about routes pass through the thread of the files
-        written = graph.stage("routes", RouteFiles(navigation.routes), navigation.requests.of_routes, thread=FILES)
+        written = graph.stage("routes", RouteFiles(routes), navigation.requests.of_routes, thread=FILES)
     if config.places.enabled and (outputs.places or takes_all or navigation or known_places is not None):
         localize_only, copy_s = (False, 0.0) if run_map is None else (run_map.localize_only, run_map.copy_s)
         places = Places(geometry, config, front_end.dense, known_places, localize_only=localize_only, copy_s=copy_s)
@@ -131,10 +129,11 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
 
     # 4. All of them, and requests, give the way to drive.
     if navigation is not None:
-        requests, states, _, drive, _, map_name = navigation
+        requests, states, drive, answer = navigation
         is_new = known_places is None or not known_places.keyframes
-        of_base, of_map = (config.controller.collision, T_base_rig, T_base_rect), map_name if places else ""
-        stage = NavigationStage(config.navigation, *of_base, of_map, is_new=is_new)
+        of_base = config.controller.collision, T_base_rig, T_base_rect
+        map_name = config.places.map if places else ""
+        stage = NavigationStage(config.navigation, *of_base, map_name, is_new=is_new)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
         given = poses, in_map, scans, wheels, requests.direct, written
         seen: list[Stream[Any]] = [stream for stream in given if stream is not None]
@@ -144,9 +143,9 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     # 5. What is made is consumed, and leaves the run.
     consumed: list[tuple[dict[str, Any], Stream[Any] | None, str]] = [
         (outputs.counters, poses, poses.thread),
+        (outputs.pairs, pairs, BACKGROUND),
         (outputs.scans, scans, "obstacles"),
         (outputs.poses, poses, BACKGROUND),
-        (outputs.commands, commands, BACKGROUND),
         (outputs.maps, maps, BACKGROUND),
         (outputs.places, in_map, BACKGROUND),
     ]
@@ -154,8 +153,6 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         for name, sink in sinks.items():
             if stream is not None:
                 graph.sink(name, sink, stream, thread=thread)
-    for name, sink in outputs.pairs.items():
-        graph.sink(name, sink, pairs, policy=NEWEST, depth=1, thread=BACKGROUND)
     leaving: list[tuple[str, Stream[Any] | None, str]] = [
         ("bus", poses, BUS),
         ("bus-drive", commands, BUS),
@@ -168,15 +165,15 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     ]
     if outputs.recorder is not None:
         images = inputs.frames if outputs.records_images else ()
-        depth = RECORDED_DEPTH if outputs.records_images else None
+        depth = RECORDED_DEPTH if outputs.records_images else 0
         made = (stream for _, stream, _ in leaving if stream is not None)
         graph.sink("record", outputs.recorder, *images, *made, depth=depth)
     for name, stream, thread in leaving:
         if stream is not None and outputs.bus is not None:
-            graph.sink(name, outputs.bus, stream, policy=NEWEST, thread=thread)
+            graph.sink(name, outputs.bus, stream, thread=thread)
     if navigation is not None and ways is not None:
         to_save = None if run_map is None else run_map.requests
-        graph.sink("taught", TaughtRoutes(navigation.routes, to_save, navigation.answer), ways, thread=FILES)
+        graph.sink("taught", TaughtRoutes(routes, to_save, answer), ways, thread=FILES)
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
     graph.sink("keyframes", lambda _: front_end.odometry.complete(), poses, thread=poses.thread)

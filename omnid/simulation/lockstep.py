@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -29,7 +28,6 @@ from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
 from omnid.engine.graph import Graph, Output, nothing
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests
@@ -200,8 +198,7 @@ def simulate(
 
     # 3. The run.
     run_places = RunPlaces(config, front_end.geometry, nothing)
-    routes = RouteFolder(Path(config.navigation.routes))
-    navigation = Navigation(requests, states, routes, take_navigation, nothing, config.places.map)
+    navigation = Navigation(requests, states, take_navigation, nothing)
     inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=navigation)
     in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
     outputs = Outputs(poses={"poses": take_pose}, scans={"scans": take_scan}, places=in_map)

@@ -24,7 +24,7 @@ PATH_POSES, PATH_STEP_M, PATH_NS = 500, 0.05, 5 * NS_PER_S
 
 
 class BusSink:
-    """Publishes encoded messages; its inbox drops the oldest (policy NEWEST), because the bus may be slow."""
+    """Publishes encoded messages; live, its inbox drops the oldest, because the bus may be slow."""
 
     def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
         """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""

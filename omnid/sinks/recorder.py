@@ -78,7 +78,7 @@ class ThinnedPairs:
 class Recorder:
     """A sink that writes every message under `/<robot>/`.
 
-    A live run gives it an inbox that drops (policy NEWEST), so that no stage waits for the disk, a RotatingLog, which
+    A live run gives it an inbox that drops, so that no stage waits for the disk, a RotatingLog, which
     never raises, and skip_invalid=True; then `invalid` counts what could not be encoded. A replay loses nothing: a
     message that cannot be encoded or written raises OmnidError or DriverError.
 

@@ -23,7 +23,7 @@ from calib.rig_file import read_rig
 from omnid.core.places.place_map import PlaceMap
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.runs.run_result import RunResult
+from omnid.runs.replay import RunResult
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.omnid.core.scenery import motion_errors

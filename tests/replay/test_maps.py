@@ -14,10 +14,9 @@ from mcap.reader import make_reader
 
 from calib import se3
 from calib.rig_file import read_rig, write_rig
-from omnid.api import replay
 from omnid.client import Robot
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED
-from omnid.formats.place_file import read_places, write_places
+from omnid.formats.place_file import read_places
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.tracking_state import MapState
@@ -151,27 +150,6 @@ def test_a_live_run_extends_its_map_now_and_then_and_at_its_end(scene: Path, oma
         code, err = daemon.end()
         assert code == 0 and "Traceback" not in err, err
     assert sessions(omap) == {0, 1, 2}
-
-
-def test_a_map_that_another_program_has_written_meanwhile_is_not_replaced(
-    scene: Path, built: Path, tmp_path: Path
-) -> None:
-    """Two replays extend one map: the last one does not win."""
-    omap, moved = tmp_path / "place.omap", tmp_path / "moved.omap"
-    places, rig = read_places(built)
-    places.poses.update({id: se3.transform(np.eye(3), [100.0, 50.0, 0.0]) @ T for id, T in places.poses.items()})
-    write_places(moved, places, rig)
-    omap.write_bytes(built.read_bytes())
-
-    def progress(done: int, expected: int | None) -> None:
-        if done and moved.exists():
-            moved.rename(omap)
-
-    result = replay(scene / "log.mcap", scene / "rig.toml", overrides=[f"places.map={omap}"], progress=progress)
-    assert result.map_file == tmp_path / "place-2.omap"
-    assert any("another program has written this map" in warning for warning in result.warnings)
-    for path, x_m in ((omap, 100.0), (tmp_path / "place-2.omap", 0.0)):
-        assert abs(min(T[0, 3] for T in read_places(path)[0].poses.values()) - x_m) < 5.0
 
 
 @pytest.fixture(scope="module")

@@ -96,16 +96,6 @@ def test_uses_the_readable_part_of_a_truncated_log(omnid: Command, tmp_path: Pat
     assert len(rows(tum)) == result.count("pairs")
 
 
-def test_skips_and_counts_broken_jpegs(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = images(scene / "log.mcap")
-    broken = {0: b"no image at all", 20: taken[20].jpeg[: len(taken[20].jpeg) // 2]}
-    log = save(tmp_path / "log.mcap", [replace(p, jpeg=broken.get(i, p.jpeg)) for i, p in enumerate(taken)])
-    result = omnid.replay(log, "--tum", tmp_path / "est.txt", rig=scene / "rig.toml")
-    assert result.code == 0 and result.count("broken") == 2
-    assert result.count("unpaired_lower") + result.count("unpaired_upper") == 2
-    assert len(rows(tmp_path / "est.txt")) == result.count("pairs") == PAIRS - 2
-
-
 def test_a_file_that_another_run_writes_is_no_output(omnid: Command, tmp_path: Path, scene: Path) -> None:
     """Two runs with one file would leave a recording that neither can be read from."""
     mcap, tum = tmp_path / "run.mcap", tmp_path / "run.txt"

@@ -21,8 +21,7 @@ from drivers.logs.streams import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.config import load_config
 from omnid.formats.tum import read_tum
-from omnid.runs.replay import ReplayOptions, run_log
-from omnid.runs.run_result import RunResult
+from omnid.runs.replay import ReplayOptions, RunResult, run_log
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import decode_diagnostics
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr

@@ -35,7 +35,7 @@ from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.safety_rules import Deadlines
-from omnid.engine.realtime import RealtimeSettings
+from omnid.engine.process import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from tests.contract.simulated_controllers import PtyMotor

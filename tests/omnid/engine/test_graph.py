@@ -1,4 +1,4 @@
-"""The graph: inboxes, tickers, the end of the run, errors, stops; threads and inline give the same results."""
+"""The graph: inboxes, the end of the run, errors, stops; threads and inline give the same results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from itertools import count
 
 import pytest
 
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph
+from omnid.engine.graph import Graph
 
 LONG_S = 20.0  # a timeout that only a defect reaches
 
@@ -71,39 +71,14 @@ def fail_at(bad: int) -> Callable[[int], int]:
     return check
 
 
-def stopped_at(graph: Graph, last: int, act: Callable[[], None]) -> Callable[[int], int]:
-    """Return a function that passes messages on and acts at one of them."""
-
-    def check(message: int) -> int:
-        if message == last:
-            act()
-        return message
-
-    return check
+@pytest.fixture(autouse=True)
+def no_thread_is_left() -> Iterator[None]:
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) <= before  # threads of other tests may have ended meanwhile
 
 
-@dataclass
-class Action:
-    """An action that sets an event at the call `enough` and fails at the call `bad`."""
-
-    enough: int
-    bad: int = -1
-    calls: int = 0
-    closed: int = 0
-    reached: threading.Event = field(default_factory=threading.Event)
-
-    def __call__(self) -> None:
-        self.calls += 1
-        if self.calls == self.bad:
-            raise OSError("no answer from the motor")
-        if self.calls >= self.enough:
-            self.reached.set()
-
-    def close(self) -> None:
-        self.closed += 1
-
-
-pytestmark = pytest.mark.usefixtures("no_thread_is_left", "default_signals")
+pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 def summed(threaded: bool) -> tuple[list[int], list[int], list[int]]:
@@ -128,7 +103,7 @@ def test_threads_give_the_results_of_inline() -> None:
 
 @both
 def test_a_source_settles_until_all_that_follows_is_done(threaded: bool) -> None:
-    graph, slow = Graph(policy=LOSSLESS, threaded=threaded, sinks_wait=True), Collect()
+    graph, slow = Graph(threaded=threaded), Collect()
     behind: list[int] = []
 
     done: list[int] = []
@@ -144,7 +119,7 @@ def test_a_source_settles_until_all_that_follows_is_done(threaded: bool) -> None
             behind.append(2 * number + 2 - len(done) - len(slow.got))
 
     passed = graph.stage("pass", Apply(lambda message: message), graph.source("numbers", numbers))
-    graph.sink("slow", slow, passed, policy=NEWEST, depth=1)
+    graph.sink("slow", slow, passed)
     graph.sink("later", Apply(later), passed, thread=passed.thread)  # the last reader, in the thread of its stage
     graph.run()
     assert slow.got == list(range(20))
@@ -176,39 +151,26 @@ def test_a_failing_stage_ends_the_run_with_its_error(threaded: bool) -> None:
 
 
 @both
-@pytest.mark.parametrize("by_signal", [True, False], ids=["signal handler", "another thread"])
-def test_a_stop_drains_and_finishes(threaded: bool, by_signal: bool) -> None:
-    graph, sink, seen, stopped = Graph(threaded=threaded), Collect(), threading.Event(), threading.Event()
+def test_a_stop_by_a_signal_drains_and_finishes(threaded: bool) -> None:
+    graph, sink = Graph(threaded=threaded), Collect()
 
-    def stop() -> None:
-        assert seen.wait(LONG_S)
-        graph.stop()
-        stopped.set()
-
-    def act() -> None:
-        seen.set()
-        if by_signal:
+    def stop_at_5(message: int) -> int:
+        if message == 5:
             os.kill(os.getpid(), signal.SIGTERM)
-        assert by_signal or stopped.wait(LONG_S)
+        return message
 
     old = signal.signal(signal.SIGTERM, lambda *_: graph.stop())
-    stopper = threading.Thread(target=stop)
     try:
-        numbers = graph.source("numbers", count)
-        graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
-        if not by_signal:
-            stopper.start()
+        graph.sink("sink", sink, graph.stage("pass", Apply(stop_at_5), graph.source("numbers", count)))
         graph.run()
     finally:
         signal.signal(signal.SIGTERM, old)
-        if not by_signal:
-            stopper.join()
     assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all messages of the source
     assert len(sink.got) >= 6 and sink.finished == 1
 
 
 def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
-    graph, slow = Graph(policy=LOSSLESS, depth=3), Collect()
+    graph, slow = Graph(depth=3), Collect()
     produced: list[int] = []
     ahead: list[int] = []
 
@@ -230,7 +192,7 @@ def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
 
 
 def test_newest_drops_the_oldest_and_counts_it() -> None:
-    graph, slow, fast, all_sent = Graph(policy=NEWEST, depth=2), Collect(), Collect(), threading.Event()
+    graph, slow, fast, all_sent = Graph(drops=True, depth=2), Collect(), Collect(), threading.Event()
 
     def numbers() -> Iterator[int]:
         yield from range(50)
@@ -241,10 +203,10 @@ def test_newest_drops_the_oldest_and_counts_it() -> None:
         return message
 
     stream = graph.source("numbers", numbers)
-    graph.sink("slow", slow, graph.stage("hold", Apply(hold), stream), policy=LOSSLESS)
-    graph.sink("fast", fast, stream, policy=LOSSLESS)
+    graph.sink("slow", slow, graph.stage("hold", Apply(hold), stream), depth=4)
+    graph.sink("fast", fast, stream, depth=50)
     graph.run()
-    assert fast.got == list(range(50))  # the policy of the sink
+    assert fast.got == list(range(50))  # the depth of the sink
     assert slow.got[-2:] == [48, 49]
     assert len(slow.got) in (2, 3)  # and perhaps the first one
     counted = {stats.name: (stats.processed, stats.dropped) for stats in graph.telemetry.stages}
@@ -252,35 +214,8 @@ def test_newest_drops_the_oldest_and_counts_it() -> None:
     assert counted["numbers"] == counted["fast"] == (50, 0)
 
 
-@both
-def test_a_ticker_runs_beside_a_slow_stage(threaded: bool) -> None:
-    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=20)
-
-    def hold(message: int) -> int:
-        assert action.reached.wait(LONG_S)  # the stage ends after 20 more ticks only
-        return message
-
-    graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("one", lambda: [7])))
-    graph.ticker("motor", 1e-3, action)
-    graph.run()
-    assert sink.got == [7]
-    assert action.closed == 1
-    assert graph.telemetry.of("motor").processed == action.calls >= 20
-
-
-@both
-def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
-    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=99, bad=3)
-    graph.sink("sink", sink, graph.source("numbers", lambda: (number % 7 for number in count())), policy=NEWEST)
-    graph.ticker("motor", 1e-3, action)
-    with pytest.raises(OSError, match="no answer") as caught:
-        graph.run()
-    assert caught.value.__notes__ == ["in 'motor'"]
-    assert (action.calls, action.closed, sink.finished) == (3, 1, 1)
-
-
 def test_stages_of_one_thread_share_it_and_pass_messages_directly() -> None:
-    graph, seen = Graph(policy=NEWEST, depth=1), Counter[tuple[str, str]]()
+    graph, seen = Graph(drops=True, depth=1), Counter[tuple[str, str]]()
     last, beside = Collect(), Collect()
 
     def noted(name: str) -> Apply:
@@ -294,7 +229,7 @@ def test_stages_of_one_thread_share_it_and_pass_messages_directly() -> None:
     first = graph.stage("first", noted("first"), numbers, thread="shared")
     graph.sink("last", last, graph.stage("second", noted("second"), first, thread="shared"), thread="shared")
     graph.stage("other", noted("other"), numbers, thread="shared")
-    graph.sink("beside", beside, first, policy=LOSSLESS)
+    graph.sink("beside", beside, first, depth=100)
     graph.run()
     of_first = graph.telemetry.of("first")
     assert of_first.processed + of_first.dropped == 100 and last.got[-1] == 99

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import os
@@ -13,34 +12,18 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from omnid.engine.graph import Graph
-from omnid.engine.logging_setup import LOGGER, StderrHandler
 from omnid.engine.process import STOP_SIGNALS, handle_stop_signals, python, python_environment
-from omnid.engine.realtime import ThreadStart, highest_priority
 from omnid.engine.robot_clock import RobotClock
-from omnid.engine.telemetry import Histogram
-from omnid.engine.threads import Poller, started
+from omnid.engine.threads import Poller
 from tests.set_clock import SetClock
 
 ROOT = Path(__file__).parents[3]
 LONG_S = 20.0  # a timeout that only a defect reaches
 
 
-def test_a_caller_goes_on_after_its_time_and_may_wait_later() -> None:
-    called, release, done = threading.Event(), threading.Event(), list[bool]()
-    assert started(called.set, "quick")(LONG_S) and called.is_set()
-    has_ended = started(lambda: done.append(release.wait(LONG_S)), "test")
-    assert not has_ended(0.01) and not done
-    release.set()
-    assert has_ended(None) and done == [True]
-
-
-@pytest.mark.usefixtures("no_thread_is_left")
 def test_the_calls_of_a_poller_go_on_after_an_error_and_end_with_close(capsys: pytest.CaptureFixture[str]) -> None:
     calls, made, enough = list[str](), threading.Event(), threading.Event()
 
@@ -58,7 +41,7 @@ def test_the_calls_of_a_poller_go_on_after_an_error_and_end_with_close(capsys: p
     assert enough.wait(LONG_S)
     poller.close()
     assert set(calls) == {"short work"} and capsys.readouterr().err.count("OSError: no link") == 1
-    assert not threading.Event().wait(0.02) and len(calls) == 3
+    assert not threading.Event().wait(0.02) and len(calls) == 3 and "short work" not in map(str, threading.enumerate())
 
 
 @pytest.mark.usefixtures("default_signals")
@@ -78,19 +61,6 @@ def test_modules_of_the_current_folder_are_not_imported(tmp_path: Path) -> None:
     environment = python_environment(KEY="a")
     done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout == f"{ROOT / 'omnid' / '__init__.py'} a\n"
-
-
-@pytest.mark.parametrize("centre", [-10.0, -5.0, 4.0])
-def test_quantiles_agree_with_sorting(centre: float) -> None:
-    durations_s = np.random.default_rng(1).lognormal(centre, 0.7, 1000)
-    histogram = Histogram()
-    for duration_s in durations_s.tolist():
-        histogram.add(duration_s)
-    for q in (0.0, 0.01, 0.5, 0.9, 0.99):
-        expected = np.quantile(durations_s, q, method="inverted_cdf")
-        assert histogram.p(q) == pytest.approx(expected, rel=0.05)
-    assert histogram.p(1.0) == histogram.max_s == durations_s.max()
-    assert histogram.count == 1000
 
 
 SETUP = "import logging; from omnid.engine.logging_setup import *; configure_logging(); configure_logging()\n"
@@ -135,66 +105,23 @@ def test_the_command_line_writes_its_error_with_priority(pipe: tuple[int, int]) 
     assert os.read(pipe[0], 1000).startswith(b"<3>the settings file '/nowhere' cannot be read")
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("two\nlines", "two lines"),
-        ("\x1b[31mred\x00\x07", r"\x1b[31mred\x00\x07"),
-        ("100 %s", "100 %s"),
-        ("x" * 10**6, "x" * 4000),
-    ],
-)
-def test_writes_one_printable_line_of_bounded_length_per_record(text: str, line: str) -> None:
-    stream = io.StringIO()
-    StderrHandler(stream).handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": logging.INFO, "msg": text}))
-    assert stream.getvalue() == f"omnid: {line}\n"
-
-
-allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
-
-
-def seen_in(name: str, start: ThreadStart) -> dict[str, tuple[str, int]]:
-    """Return kernel name and policy of the threads of a graph: a source of this name and its sink."""
-    seen = {}
-
-    def record(whose: str) -> None:
-        task = Path(f"/proc/self/task/{threading.get_native_id()}")
-        seen[whose] = (task.joinpath("comm").read_text().strip(), os.sched_getscheduler(0))
-
-    def numbers() -> range:
-        record("source")
-        return range(1)
-
-    graph = Graph(on_thread=start)
-    graph.sink("sink", SimpleNamespace(process=lambda number: record("sink")), graph.source(name, numbers))
-    graph.run()
-    return seen
-
-
-@allowed
-def test_only_the_named_thread_has_priority() -> None:
-    seen = seen_in("lower", ThreadStart({"lower": 10}))
-    assert seen == {"source": ("lower", os.SCHED_FIFO | os.SCHED_RESET_ON_FORK), "sink": ("sink", os.SCHED_OTHER)}
-
-
-def test_reports_a_refused_priority_once_with_advice() -> None:
+def test_a_refused_priority_is_reported_with_advice() -> None:
     """In a process of its own, without rights."""
     script = """
 import json, os, resource
-from omnid.engine.realtime import ThreadStart
+from omnid.engine.process import start_thread
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 if os.getuid() == 0:
     os.setgid(65534); os.setuid(65534)
 reported = []
-start = ThreadStart({"motor": 20, "lower": 10}, lambda *words: reported.append(words))
-for name in ("motor", "lower", "stereo"):
-    start(name)
+for name in ("motor", "stereo"):
+    start_thread({"motor": 20}, lambda *words: reported.append(words), name)
 print(json.dumps([*reported, os.sched_getscheduler(0)]))
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
     (priority, text), policy = json.loads(done.stdout)
     assert priority == logging.WARNING and text.startswith("thread 'motor' cannot have real-time priority 20")
-    assert "LimitRTPRIO=20" in text and policy == os.SCHED_OTHER
+    assert "LimitRTPRIO" in text and policy == os.SCHED_OTHER
 
 
 S = 10**9
@@ -223,7 +150,7 @@ def test_a_step_is_found_and_reported_once_and_stamps_from_before_it_keep_their_
     # A sender whose clock is another one is off by the step; sent once more it is still older.
     other_ns = computer.unix_ns - change_ns
     assert clock.age_ns(other_ns) == change_ns
-    assert len(lines) == 1 and words in lines[0] and clock.stats()["steps"] == 1
+    assert len(lines) == 1 and words in lines[0] and clock.steps == 1
 
 
 @pytest.mark.parametrize("rate", [-500e-6, 40e-6])
@@ -339,10 +266,5 @@ def test_code_that_others_could_have_written_is_not_read(copy: Path) -> None:
     for kept in cache.glob("caller_kernels-*"):
         kept.chmod(0o720)
     assert run(copy, cache)[0].startswith("INFO compiling") and run(copy, cache) == [HALVES]
-    for mode, owner in ((0o702, -1), (0o700, 12345)):
-        cache.chmod(mode)
-        if owner >= 0 and os.geteuid() != 0:
-            continue
-        os.chown(cache, owner, -1)
-        warning, result = run(copy, cache)
-        assert "it belongs to another user, or others can write to it" in warning and result == HALVES
+    cache.chmod(0o702)
+    assert "it belongs to another user, or others can write to it" in run(copy, cache)[-1]

@@ -190,7 +190,7 @@ def attached(path: Path) -> list[str]:
 def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(file_s=1.0, free_bytes=0))
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), 0))
+    recorder = open_recorder(config, "", lambda *_: None, clock=set_clock(), encode=Encoder(np.eye(4), 0))
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
     recorder.close()

@@ -22,7 +22,7 @@ from omnid.core.rig.rig_health import (
     RigHealth,
 )
 from omnid.diagnostics.status import rig_stats
-from omnid.engine.graph import NEWEST, Graph
+from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
@@ -75,7 +75,7 @@ def monitored(folder: Path, rig: Rig, most: int | None = None) -> tuple[RigHealt
     frames = graph.source("log", lambda: islice(reader.frames(), None if most is None else 2 * most))
     pairs = graph.stage("pair", Synchronise(rig, PairConfig()), frames)
     panoramas = graph.stage("dewarp", Dewarp(place, config), pairs)
-    graph.sink("rig", Driver(monitor), panoramas, policy=NEWEST, depth=1)
+    graph.sink("rig", Driver(monitor), panoramas)
     graph.sink("kept", kept, panoramas)
     graph.run()
     return monitor, kept
