@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import OdometryLimits
-from omnid.core.odometry.exposure_times import Exposure, RigVelocity
+from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
@@ -102,7 +102,7 @@ class Drive:
             frame = cameras.frame(10_000 + SEARCHES * number + search, T_world_rig)
             if loss == "covered":
                 frame = half_covered(frame, int(rng.integers(frame.lower.width)))
-            at_rest = Exposure.of(frame.times, RigVelocity(np.zeros(6), np.eye(6)), cameras.model)
+            at_rest = Exposure(frame.times, NO_VELOCITY, cameras.model)
             started = time.process_time()
             pose = self.odometry.relocalise(frame, at_rest)
             longest_s = max(longest_s, time.process_time() - started)

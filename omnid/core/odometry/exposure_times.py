@@ -92,11 +92,6 @@ class Exposure:
     motion: RigVelocity
     model: StereoModel
 
-    @staticmethod
-    def of(times: PixelTimes, motion: RigVelocity, model: StereoModel) -> Exposure:
-        """Return the exposure of a frame: where all pixels are exposed at the stamp, views are left as seen."""
-        return Exposure(times, NO_VELOCITY if times.is_at_once else motion, model)
-
     @property
     def is_known(self) -> bool:
         """True if the motion is known well enough to check a rig by views that are corrected for it."""
