@@ -194,7 +194,7 @@ class Robot:
     def driver(self, source: str = "") -> Driver:
         """Return a sender of commands to the wheels.
 
-        source: one of controller.sources.names, such as "planner"; empty for that of the highest priority.
+        source: "operator" or "planner"; empty: the operator, who has priority.
         """
         self._time.now_ns(waits=not self._time.is_known)
         return Driver(self._session, self.name, self._time, source)

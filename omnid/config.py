@@ -294,7 +294,7 @@ def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str
 
 # Keys and sections that only one of `omnid run` and `omnid replay` uses; the longest path counts. "": both use it.
 _RUN_ONLY: Final = (
-    *("bus.panorama_hz", "cameras", "controller.arming", "controller.sources", "live", "places.save_s", "navigation"),
+    *("bus.panorama_hz", "cameras", "controller.arming", "live", "places.save_s", "navigation"),
     *("realtime", "record", "rig", "service"),
 )
 _USED_ONLY_BY: Final[Mapping[str, str]] = {

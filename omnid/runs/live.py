@@ -24,7 +24,7 @@ from omnid.config import Config
 from omnid.controller.ipc import ARMED, ControllerState
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import MANUAL
-from omnid.core.control.command_sources import PLANNER
+from omnid.core.control.command_sources import SOURCES
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
@@ -58,7 +58,6 @@ from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.topics import Answer, Request
 
 NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
-NO_PLANNER: Final = f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off"
 NO_SAMPLES: Final = "it is not used, see motion.wheels, motion.wheel_joints and motion.imu"
 NO_MAP_FILE: Final = (
     "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
@@ -237,17 +236,14 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         if config.motion.wheels != "off" and not robot.brings_samples:
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
-        if PLANNER in config.controller.sources.names:
-            navigation = Navigation(requests, states, PlannerDrive(controller, bus.answer), bus.answer)
-        else:
-            session.warn(NO_PLANNER)
+        navigation = Navigation(requests, states, PlannerDrive(controller, bus.answer), bus.answer)
     inputs = Inputs(frames, run_places, controller, navigation, map_is_read, config.live.cloud_s)
     stages = wire(config, inputs, front_end, graph, outputs)
 
     # 4. What comes from the bus: samples of gyro and wheels, unless they come with the images of a log or of a
     #    simulation, whose motion others would not fit; a motor controller gives those of its wheels. Commands and
     #    requests; without a motor all but those to save the map are refused.
-    sources, joints = config.controller.sources.names, joint_wheels(config)
+    joints = joint_wheels(config)
     used = {
         topics.IMU: config.motion.imu != "off",
         topics.JOINT_STATES if joints else topics.WHEEL_ODOM: config.motion.wheels != "off" and controller is None,
@@ -265,15 +261,15 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
     def ask(command: NavigationCommand) -> None:
         requests.put(command._replace(stop_count=controller.statistics.state.stop_count if controller else 0))
 
-    taken, saves = topics.command_topics(sources), run_places.requests
-    why_not = dict.fromkeys(topics.NAVIGATION_TOPICS, NO_PLANNER) if controller else dict.fromkeys(taken, NO_MOTOR)
+    taken, saves = topics.command_topics(SOURCES), run_places.requests
+    why_not = {} if controller else dict.fromkeys(taken, NO_MOTOR)
     why_not |= {topics.MAP: NO_MAP_FILE, **dict.fromkeys(topics.SENSOR_TOPICS, NO_SAMPLES)}
     commands = CommandReceiver(
         freshness,
         controller=controller,
-        sources=sources,
+        sources=SOURCES,
         is_unique=lambda: bus.is_unique,
-        navigate=ask if controller is not None and PLANNER in sources else None,
+        navigate=ask if controller is not None else None,
         save_map=None if saves is None else lambda id: saves.push(SaveMap(id)),
         sensors=sensors,
         why_not=why_not,

@@ -180,7 +180,7 @@ class CommandReceiver:
         counts = self._counts.get(request.topic, self.wheels)
         try:
             if (action := self._actions.get(request.topic)) is None:
-                raise Refused("not available", self._why_not.get(request.topic, "see controller.sources.names"))
+                raise Refused("not available", self._why_not.get(request.topic, "the sources are operator and planner"))
             if len(request.payload) > (longest := topics.command_of(request.topic).longest):
                 raise Refused("too long", f"{len(request.payload)} bytes, expected at most {longest}")
             action(request, arrival_ns)

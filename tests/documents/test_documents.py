@@ -16,6 +16,7 @@ from ruamel.yaml import YAML
 import omnid
 from omnid.cli import COMMANDS, command_at
 from omnid.config import Config
+from omnid.core.control.command_sources import SOURCES
 from omnid.transport.topics import PUBLISHED, command_topics, ros_name
 
 ROOT = Path(__file__).parents[2]
@@ -126,7 +127,7 @@ def test_images_are_small() -> None:
 def test_nav2_uses_topics_that_exist() -> None:
     folder = DOCS / "ros2"
     text = "".join((folder / name).read_text("utf-8") for name in ("nav2.launch.py", "nav2_params.yaml"))
-    known = {ros_name("omnid", name) for name in (*PUBLISHED, *command_topics(Config().controller.sources.names))}
+    known = {ros_name("omnid", name) for name in (*PUBLISHED, *command_topics(SOURCES))}
     used = set(re.findall(r"/omnid/[\w/]+", text))
     assert {"/omnid/scan", "/omnid/map", "/omnid/odom", "/omnid/cmd/planner/twist"} <= used <= known
     compile((folder / "nav2.launch.py").read_text("utf-8"), "nav2.launch.py", "exec")

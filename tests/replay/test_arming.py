@@ -27,7 +27,7 @@ from tests.waiting import PATIENCE_S, wait_until
 
 # At half the speed of the log: the tests look at what is commanded.
 MANUAL = (
-    *patient("controller.arming=manual", "controller.deadlines.command_s=8", "controller.sources.hold_s=8"),
+    *patient("controller.arming=manual", "controller.deadlines.command_s=8"),
     "--pace",
     "0.5",
 )

@@ -2,52 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple
-
-from msgspec import Meta
+from typing import Final, NamedTuple
 
 from omnid.core.control.heading_controller import Setpoint
-from omnid.errors import OmnidError
 
 OPERATOR: Final = "operator"
 PLANNER: Final = "planner"
-_NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
-# Topics below cmd/.
-_RESERVED: Final = ("twist", "heading", "stop", "arm", "bumper", "cliff", "goal", "path", "navigation", "route")
+SOURCES: Final = (OPERATOR, PLANNER)  # in the order of their priority
 
 # Reasons to refuse a command, which are counted.
 UNKNOWN_SOURCE: Final = "unknown source"
 LOWER_PRIORITY: Final = "a source of higher priority drives"
 OTHER_SENDER: Final = "another sender drives"
-
-
-@dataclass(frozen=True, slots=True)
-class SourceSettings:
-    """Sources of commands in the order of their priority."""
-
-    names: Annotated[
-        tuple[str, ...],
-        "sources of commands, highest priority first: topics "
-        "cmd/NAME/twist and cmd/NAME/heading; cmd/twist and cmd/heading are the first one's",
-    ] = (OPERATOR, PLANNER)
-    hold_s: Annotated[
-        float,
-        Meta(ge=0.05, le=60),
-        "a source keeps out those of lower priority, and its sender all others, for so long "
-        "after its newest command, s",
-    ] = 0.5
-
-    def __post_init__(self) -> None:
-        """Raise OmnidError for names that cannot be part of a topic or are one already, and for one given twice."""
-        usable = {name for name in self.names if _NAME.fullmatch(name) and name not in _RESERVED}
-        if not 0 < len(usable) == len(self.names):
-            raise OmnidError(
-                f"controller.sources.names has {list(self.names)}; give one or more of small letters, digits and '_', "
-                f"each once, none of {', '.join(_RESERVED)}"
-            )
 
 
 class TimedSetpoint(NamedTuple):
@@ -71,9 +38,8 @@ class CommandSelector:
     must send again. Refused commands are counted by reason. Programs without an identity count as one.
     """
 
-    def __init__(self, settings: SourceSettings) -> None:
-        self._priorities = {name: priority for priority, name in enumerate(settings.names)}
-        self._hold_ns = round(settings.hold_s * 1e9)
+    def __init__(self, hold_s: float) -> None:
+        self._hold_ns = round(hold_s * 1e9)
         self.current: TimedSetpoint | None = None  # the newest accepted command
         self.refused: Counter[str] = Counter()
         self.conflict = ""  # the last two senders that have used one source at the same time, in words
@@ -87,7 +53,7 @@ class CommandSelector:
             self.current = command
 
     def _refusal(self, command: TimedSetpoint) -> str:
-        if command.source not in self._priorities:
+        if command.source not in SOURCES:
             return UNKNOWN_SOURCE
         current = self.current
         if current is None or command.arrival_ns - current.arrival_ns > self._hold_ns:
@@ -97,5 +63,4 @@ class CommandSelector:
                 return ""
             self.conflict = f"two programs send commands as {command.source!r}: those of {command.sender!r} are refused"
             return OTHER_SENDER
-        higher = self._priorities[command.source] < self._priorities[current.source]
-        return "" if higher else LOWER_PRIORITY
+        return "" if command.source == OPERATOR else LOWER_PRIORITY

@@ -15,7 +15,7 @@ from msgspec import Meta
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest
 from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan
-from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
+from omnid.core.control.command_sources import CommandSelector, TimedSetpoint
 from omnid.core.control.contacts import Contacts
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
@@ -57,7 +57,6 @@ class ControllerSettings:
     deadlines: Deadlines = field(default_factory=Deadlines)
     limits: VelocityLimits = field(default_factory=VelocityLimits)
     setpoint: ReplaySetpoint = field(default_factory=ReplaySetpoint)
-    sources: SourceSettings = field(default_factory=SourceSettings)
     arming: Annotated[
         Literal["manual", "automatic"],
         "manual: the wheels turn only after cmd/arm (`omnid arm`), again after each stop and each "
@@ -69,11 +68,11 @@ class ControllerSettings:
 
     @property
     def of_replay(self) -> ControllerSettings:
-        """The settings of a replay, whose only source is its setpoint: it cannot be armed from outside.
+        """The settings of a replay, which cannot be armed from outside.
 
         It arms itself, also after faults that have passed: to start a replay with a motor is to ask for its motion.
         """
-        return replace(self.of_log, arming=AUTOMATIC, sources=SourceSettings())
+        return replace(self.of_log, arming=AUTOMATIC)
 
     @property
     def of_log(self) -> ControllerSettings:
@@ -141,7 +140,7 @@ class ControlLaw:
         self.arming = Arming(settings.arming)
         self.plausibility = Plausibility(settings.trust, settings.motion)
         self.contacts = Contacts()
-        self.commands = CommandSelector(settings.sources)
+        self.commands = CommandSelector(settings.deadlines.command_s)
         limits = settings.limits
         self.collision = CollisionMonitor(settings.collision, limits.deceleration_mps2, limits.yaw_acceleration_radps2)
         self.motion = STOP  # motion of the base now, from which the next step continues

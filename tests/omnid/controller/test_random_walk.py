@@ -45,7 +45,7 @@ TICKS = 6_000
 PHASE = 40  # ticks with the same motor, images and calm
 MANY_TICKS = 1_000_000
 DEADLINES = SETTINGS.deadlines
-HOLD_NS = round(SETTINGS.sources.hold_s * 1e9)
+HOLD_NS = round(SETTINGS.deadlines.command_s * 1e9)
 # The angle that it turns at the highest rate within 0.15 s, and then until it has braked.
 LEAD_RAD = LIMITS.yaw_rate_radps * 0.15 + LIMITS.yaw_rate_radps**2 / (2 * LIMITS.yaw_acceleration_radps2)
 SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", "c"), ("autopilot", "d"))

@@ -19,7 +19,6 @@ from omnid.core.control.command_sources import (
     PLANNER,
     UNKNOWN_SOURCE,
     CommandSelector,
-    SourceSettings,
     TimedSetpoint,
 )
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
@@ -49,7 +48,6 @@ from omnid.core.control.safety_rules import (
     Deadlines,
     stop_reason,
 )
-from omnid.errors import OmnidError
 
 TICK_NS, TICK_S = 20_000_000, 0.02
 START_NS = 10**12
@@ -156,7 +154,7 @@ HOLD_S = 0.5
 
 @pytest.fixture
 def selector() -> CommandSelector:
-    return CommandSelector(SourceSettings(("joystick", OPERATOR, PLANNER), HOLD_S))
+    return CommandSelector(HOLD_S)
 
 
 def offer(selector: CommandSelector, at_s: float, source: str = OPERATOR, sender: str = "a") -> bool:
@@ -188,13 +186,6 @@ def test_refuses_unknown_sources_and_keeps_the_newest_of_reordered_commands(sele
     assert not offer(selector, 0.0, "autopilot") and selector.refused == {UNKNOWN_SOURCE: 1}
     assert offer(selector, 1.0) and not offer(selector, 0.9)
     assert selector.current is not None and selector.current.arrival_ns == 10**12 + 10**9
-
-
-@pytest.mark.parametrize("names", [(), ("a",) * 2, ("A",), ("a/b",), ("stop",), ("",), ("x" * 33,)])
-def test_refuses_names_that_are_no_topics(names: tuple[str, ...]) -> None:
-    with pytest.raises(OmnidError, match=r"controller\.sources\.names"):
-        SourceSettings(names)
-    assert SourceSettings(("a",)).names == ("a",)
 
 
 # The law of motion: heading controller, limits of speed, and goals for motor controllers that hold headings.
