@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections import Counter
 from contextlib import closing
 from importlib.util import find_spec
 from itertools import chain, islice
@@ -23,14 +24,14 @@ from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.calibration import snapshot
 from omnid.calibration.images import Image
 from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, failed, settings_of
-from omnid.config import FIRST_SETTINGS, Config
+from omnid.config import FIRST_SETTINGS
 from omnid.doctor import checks
 from omnid.doctor.wheel_wiring import tested_drive
 from omnid.errors import OmnidError
 from omnid.light.exposure import USUAL_HZ
 from omnid.monitor.listen import listen as listen_to
 from omnid.service import install
-from omnid.settings import changed, dump, dump_minimal, value_at
+from omnid.settings import dump, dump_minimal
 from omnid.transport.session import zenoh_config
 
 
@@ -57,10 +58,7 @@ def print_config(args: argparse.Namespace) -> int:
     # Words that only the daemon's start would refuse.
     zenoh_config(config.bus)
     motor_protocol(config.motor.protocol)
-    paths = changed(config)
-    print(f"{args.file}: good; {len(paths)} settings differ from their defaults")
-    for path in paths:
-        print(f"{path} = {value_at(config, path)!r}, default {value_at(Config(), path)!r}")
+    print(f"{args.file}: good")
     return 0
 
 
@@ -151,8 +149,9 @@ def doctor(args: argparse.Namespace) -> int:
     ):
         print(finding, flush=True)
         found.append(finding)
-    print(checks.summary(found))
-    return int(any(finding.level == "error" for finding in found))
+    counts = Counter(finding.level for finding in found)
+    print(f"{counts['error']} errors, {counts['warning']} warnings, {counts['ok']} ok")
+    return int(counts["error"] > 0)
 
 
 _ADVICE = """
@@ -219,12 +218,11 @@ def _images(settings: V4l2Settings, camera: Camera) -> list[Image]:
 def test_motor(args: argparse.Namespace) -> int:
     """Turn each wheel, ask what moved, print the settings for that.
 
-    It turns each motor forwards and back, asks which wheel moved and which way, then turns both wheels a number of
-    times and asks for the true number. It prints the lines of the configuration that make the wheels turn as commanded.
+    It turns each motor forwards and back, and asks which wheel moved and which way. It prints the lines of the
+    configuration that make the wheels turn as commanded.
 
     --motor PORT [motor.port]  serial port of the controller, or 'simulated'; default: motor.port of the settings
     --speed MPS=0.1            of a wheel, m/s
-    --turns TURNS=3 0..1000    of the wheels for the scale, 0: do not test it
 
     examples:
       motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml
@@ -234,11 +232,9 @@ def test_motor(args: argparse.Namespace) -> int:
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
     motor_protocol(config.protocol)  # known before anybody is asked to raise the robot
-    drive = tested_drive(config, ask, speed_mps=args.speed, turns=args.turns)
-    # Always the keys of the wiring, that of the scale only where the test changed it.
-    values = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
-    values |= {"gear": repr(drive.gear)} if drive.gear != config.drive.gear else {}
-    print("\n[motor.drive]", *(f"{key} = {value}" for key, value in values.items()), sep="\n")
+    drive = tested_drive(config, ask, speed_mps=args.speed)
+    keys = ("swapped", "reverse_left", "reverse_right")
+    print("\n[motor.drive]", *(f"{key} = {str(getattr(drive, key)).lower()}" for key in keys), sep="\n")
     print("as it was set" if drive == config.drive else "different from the settings so far")
     return 0
 

@@ -37,10 +37,8 @@ from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
 import msgspec
 
 if TYPE_CHECKING:  # the help and other commands do not load these
-    from calib.rig import Rig
     from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.frame import Camera
-    from drivers.logs.log_reader import LogCameras
     from omnid.config import Config
 
 PROFILES: Final = {"small": ("panorama.scale=0.5", "odometry.limits.features=250")}
@@ -149,7 +147,7 @@ def two_sides(text: str) -> tuple[int, int]:
 # Types of values by the word that stands for them in the help; a file or a folder is a path, all others are text.
 TYPES: Final[Mapping[str, Callable[[str], Any]]] = {
     **dict.fromkeys(("N", "PX", "BITS"), int),
-    **dict.fromkeys(("X", "S", "M", "MM", "MS", "HZ", "MPS", "TURNS", "FACTOR", "SHARE", "RATIO"), float),
+    **dict.fromkeys(("X", "S", "M", "MM", "MS", "HZ", "MPS", "FACTOR", "RATIO"), float),
     **dict.fromkeys(("6x7", "6x6", "3840x1920"), two_sides),
 }
 _PATHS: Final = {"FILE", "FOLDER", "DIR", "LOG", "EST", "TRUTH", "OUT"}
@@ -221,20 +219,6 @@ HEIGHT: Final = """
 --height-m M 0.1..10  height of the lower viewpoint (the focus of the lower mirror) above the floor; without it `omnid
                       calibrate drive` finds it by the floor
 """
-
-
-def height_of(rig: Rig) -> str:
-    """Return the height that a rig states, in words."""
-    if (height_m := rig.height_m()) is None:
-        return "no height of the cameras (--height-m, or `omnid calibrate drive LOG --only height`)"
-    return f"cameras {height_m:.3f} m above the floor"
-
-
-def log_cameras(args: argparse.Namespace) -> LogCameras:
-    """Return the cameras of a log by --lower, --upper, --bits, --rate and --time."""
-    from drivers.logs.log_reader import LogCameras
-
-    return LogCameras(args.lower, args.upper, int(args.bits), args.rate or 0.0, args.time)
 
 
 def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:

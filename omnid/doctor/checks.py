@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
@@ -43,12 +43,6 @@ class Finding(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.level:<8} {self.subject:<13} {self.found}" + (f"; {self.advice}" if self.advice else "")
-
-
-def summary(findings: Sequence[Finding]) -> str:
-    """Return the last line of the report."""
-    errors, warnings = (sum(finding.level == level for finding in findings) for level in ("error", "warning"))
-    return f"{errors} errors, {warnings} warnings, {len(findings) - errors - warnings} ok"
 
 
 def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path) -> Iterator[Finding]:

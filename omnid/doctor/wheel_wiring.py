@@ -39,15 +39,11 @@ def tested_drive(
     ask: Callable[[str], str],
     *,
     speed_mps: float,
-    turns: float,
-    move_s: float = MOVE_S,
-    rest_s: float = REST_S,
 ) -> DifferentialDrive:
     """Turn the wheels, ask what they did, and return the settings of the drive as the wiring is.
 
-    ask: prints a question, returns the answer. speed_mps: of a wheel. turns: of each wheel, for the scale; 0: leave
-    that out. move_s, rest_s: how long a motor turns alone in each direction, and rests. The wheels stop at the end.
-    Raises OmnidError for wrong arguments, and where the answers do not determine the settings.
+    ask: prints a question, returns the answer. speed_mps: of a wheel. The wheels stop at the end. Raises OmnidError for
+    wrong arguments, and where the answers do not determine the settings.
     """
     if config.protocol == "line":
         raise OmnidError(
@@ -61,7 +57,7 @@ def tested_drive(
         )
     if ask(BEFORE).lower() != "yes":
         raise OmnidError("not begun: only `yes` starts the motors")
-    # 1. Each motor turns alone, forwards and back: its wheel, and the direction of that.
+    # Each motor turns alone, forwards and back: its wheel, and the direction of that.
     drive = replace(config.drive, swapped=False, reverse_left=False, reverse_right=False)
     with ExitStack() as closing:
         motor = open_motor(replace(config, drive=drive), closing)
@@ -70,37 +66,23 @@ def tested_drive(
             turn = -1.0 if channel == 1 else 1.0  # the command of the other wheel becomes 0
             for sign in (1, -1):
                 velocity_mps, yaw_rate_radps = sign * speed_mps / 2, sign * turn * speed_mps / drive.track_m
-                _move(motor, config, velocity_mps, yaw_rate_radps, move_s)
-                time.sleep(rest_s)
+                _move(motor, config, velocity_mps, yaw_rate_radps)
+                time.sleep(REST_S)
 
-        first, second = (_seen(channel, motion, ask) for channel in (1, 2))
+        turned_deg = math.degrees(speed_mps * MOVE_S / drive.wheel_radius_m)
+        first, second = (_seen(channel, turned_deg, motion, ask) for channel in (1, 2))
     if first.side == second.side:
         raise OmnidError(f"both motors turned the {first.side} wheel, which cannot be: begin again")
     left, right = (first, second) if first.side == "left" else (second, first)
-    drive = replace(
-        drive, swapped=first.side == "right", reverse_left=not left.forward, reverse_right=not right.forward
+    return replace(drive, swapped=first.side == "right", reverse_left=not left.forward, reverse_right=not right.forward)
+
+
+def _seen(channel: int, turned_deg: float, motion: Callable[[int], None], ask: Callable[[str], str]) -> Seen:
+    """Turn one motor, and ask what moved; turned_deg: by which its wheel turns one way, where the gear is right."""
+    question = (
+        f"Motor {channel} turned its wheel by {turned_deg:.0f} deg and back, or motor.drive.gear is wrong. Name the "
+        "wheel that moved (l left, r right, b both, n none, "
     )
-    if not turns:
-        return drive
-    # 2. Both wheels turn a number of times: the ratio to the true number corrects the gear.
-    around_m = math.tau * drive.wheel_radius_m
-    with ExitStack() as closing:
-        motor = open_motor(replace(config, drive=drive), closing)
-        ask(f"Mark both tyres. The wheels will turn forwards {turns:g} times. Press Enter: ")
-        commanded = _move(motor, config, speed_mps, 0.0, turns * around_m / speed_mps) * speed_mps / around_m
-        time.sleep(rest_s)
-    while True:
-        answer = ask(f"{commanded:.2f} turns were commanded. How many were there (Enter if as many)? ")
-        if not answer:
-            return drive
-        with suppress(ValueError):  # no number: ask again
-            if 0 < (found := float(answer.replace(",", "."))) < math.inf:
-                return replace(drive, gear=float(f"{drive.gear * commanded / found:.4g}"))
-
-
-def _seen(channel: int, motion: Callable[[int], None], ask: Callable[[str], str]) -> Seen:
-    """Turn one motor, and ask what moved."""
-    question = f"Motor {channel} turned one way and back. Name the wheel that moved (l left, r right, b both, n none, "
     side = None
     while side is None:
         motion(channel)
@@ -122,21 +104,18 @@ def _seen(channel: int, motion: Callable[[int], None], ask: Callable[[str], str]
     return Seen(side, answer == "y")
 
 
-def _move(
-    motor: MotorDriver, config: MotorSettings, velocity_mps: float, yaw_rate_radps: float, duration_s: float
-) -> float:
-    """Drive for this time, then stop; return the time for which it drove, s."""
+def _move(motor: MotorDriver, config: MotorSettings, velocity_mps: float, yaw_rate_radps: float) -> None:
+    """Drive for MOVE_S, then stop."""
     _stop(motor)  # after a pause the driver sends one in place of the first command
-    begin_s = next_s = time.monotonic()
-    while time.monotonic() < begin_s + duration_s:
+    next_s = time.monotonic()
+    end_s = next_s + MOVE_S
+    while time.monotonic() < end_s:
         # Without an answer the wheels keep turning, because the controller's watchdog expires much later.
         with suppress(LateReplyError):
             motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
         next_s += 1 / config.rate_hz
-        time.sleep(max(0.0, min(next_s, begin_s + duration_s) - time.monotonic()))
-    moved_s = time.monotonic() - begin_s  # the answer to the stop may come late, the stop does not
+        time.sleep(max(0.0, min(next_s, end_s) - time.monotonic()))
     _stop(motor)
-    return moved_s
 
 
 def _stop(motor: MotorDriver) -> None:

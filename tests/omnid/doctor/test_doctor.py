@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import grp
-import math
 import os
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,14 +18,11 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.controller.motor import MotorSettings
-from omnid.doctor import checks
+from omnid.doctor import checks, wheel_wiring
 from omnid.doctor.checks import Finding, bus, cameras, disk, motor, rig
-from omnid.doctor.wheel_wiring import tested_drive as drive_by_answers
-from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
 from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, PtyMotor, SimulatedController
 from tests.replay.command import Command
-from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
 
@@ -146,7 +140,6 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert "cameras.width_px" in capsys.readouterr().err
 
 
-ROOT = Path(__file__).parents[3]
 RADIUS_M = 0.02
 
 
@@ -165,80 +158,48 @@ class WatchedController:
 
 
 class Person:
-    """Looks at the wheels, and answers the questions."""
+    """Standard input of the command: the answers of somebody who looks at the wheels, after those that are given."""
 
-    def __init__(self, base: WatchedController) -> None:
-        self.base = base
-        self._travel_m = 0.0
-        self.questions: list[str] = []
+    def __init__(self, watched: WatchedController, capsys: pytest.CaptureFixture[str], given: Sequence[str]) -> None:
+        self._watched, self._capsys, self._given = watched, capsys, list(given)
 
-    def answer(self, question: str) -> str:
-        """Return the answer to a question."""
-        self.questions.append(question)
+    def readline(self) -> str:
+        """Return the answer to the question that was printed."""
+        question, notes = self._capsys.readouterr().out, self._watched.notes
+        if self._given:
+            return self._given.pop(0)
         if "wheel that moved" in question:
-            moved = next(note for note in self.base.notes if any(note))
-            self._first, self.base.notes[:] = moved, []
-            left, right = (abs(speed) > 1e-6 for speed in moved)
-            return "b" if left and right else "l" if left else "r"
-        if "forwards first" in question:
-            return "y" if sum(self._first) > 0 else "n"
-        if "How many" in question:
-            wait_until(
-                lambda: (
-                    not any(self.base.base.commanded_mps)
-                    and self.base.base.velocity_mps == 0
-                    and self.base.base.yaw_rate_radps == 0
-                ),
-                "wheels that stand",
-            )
-            return f"{(self.base.base.travel_m[0] - self._travel_m) / (math.tau * RADIUS_M):.3f}"
-        self._travel_m = self.base.base.travel_m[0]
-        return "yes"
-
-
-@contextlib.contextmanager
-def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, Person, PtyMotor]]:
-    """Yield settings that do not know the wiring, a person, and the base."""
-    drive = DifferentialDrive(wheel_radius_m=RADIUS_M, gear=20.0)
-    true = replace(drive, **wiring)  # type: ignore[arg-type]
-    watched = WatchedController(SIMULATED_CONTROLLERS[protocol](true))
-    with contextlib.closing(PtyMotor(watched)) as motor:
-        # At 5 Hz an answer may take 0.16 s: a busy computer is not what is tested here.
-        settings = MotorSettings(motor.port, protocol, rate_hz=5.0, watchdog_ms=1000, drive=drive)
-        yield settings, Person(watched), motor
+            self._first = next(note for note in notes if any(note))
+            notes.clear()
+            left, right = (abs(speed) > 1e-6 for speed in self._first)
+            return "b\n" if left and right else "l\n" if left else "r\n"
+        return "n\n" if "forwards first" in question and sum(self._first) < 0 else "yes\n"
 
 
 @pytest.mark.parametrize(
-    ("answers", "message"),
-    [(["n"], "did not move"), (["b"], "moved both"), (["l", "y", "l", "y"], "which cannot be")],
+    ("given", "result"),
+    [
+        ((), "[motor.drive]\nswapped = true\nreverse_left = true\nreverse_right = false\ndifferent from"),
+        (("yes", "n"), "did not move"),
+        (("yes", "b"), "moved both"),
+        (("yes", "l", "y", "l", "y"), "which cannot be"),
+        (("no",), "not begun"),
+        (("",), "no answer"),
+    ],
 )
-def test_answers_without_a_result(answers: list[str], message: str) -> None:
-    with simulated("roboteq") as (config, _, motor):
-        given = iter(["yes", *answers])
-        with pytest.raises(OmnidError, match=message):
-            drive_by_answers(config, lambda _: next(given), speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0)
-        assert not any(motor.base.commanded_mps) and not list(given)
-
-
-def test_the_command_asks_and_prints() -> None:
-    with simulated("roboteq", swapped=True, reverse_left=True, gear=1.0) as (config, person, motor):
-        command = [
-            *(sys.executable, "-m", "omnid", "motor", "test", "--motor", config.port, "--turns", "1", "--speed", "0.4"),
-            *("--set", "motor.protocol=roboteq", "--set", "motor.watchdog_ms=1000", "--set", "motor.rate_hz=5"),
-            *("--set", f"motor.drive.wheel_radius_m={RADIUS_M}"),
-        ]
-        with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdin is not None and process.stdout is not None
-            shown = ""
-            while letter := process.stdout.read(1):
-                shown += letter
-                if shown.endswith(("? ", ": ")):
-                    process.stdin.write(f"{person.answer(shown)}\n")
-                    process.stdin.flush()
-                    shown = ""
-        assert process.returncode == 0 and not any(motor.base.commanded_mps)
-    assert "forwards first" in " ".join(person.questions)
-    assert "[motor.drive]\nswapped = true\nreverse_left = true" in shown and "different from the settings" in shown
+def test_the_wiring_follows_from_answers(
+    given: tuple[str, ...], result: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true = DifferentialDrive(wheel_radius_m=RADIUS_M, swapped=True, reverse_left=True)
+    watched = WatchedController(SIMULATED_CONTROLLERS["roboteq"](true))
+    monkeypatch.setattr(wheel_wiring, "MOVE_S", 0.3)
+    monkeypatch.setattr("sys.stdin", Person(watched, capsys, given))
+    # At 5 Hz an answer may take 0.16 s: a busy computer is not what is tested here.
+    settings = ("protocol=roboteq", "watchdog_ms=1000", "rate_hz=5", f"drive.wheel_radius_m={RADIUS_M}")
+    with contextlib.closing(PtyMotor(watched)) as motor:
+        words = [word for setting in settings for word in ("--set", f"motor.{setting}")]
+        code, out, err = Command(capsys)("motor", "test", "--motor", motor.port, "--speed", "0.4", *words)
+        assert code == (2 if given else 0) and result in out + err and not any(motor.base.commanded_mps)
 
 
 @pytest.mark.parametrize(
@@ -251,10 +212,3 @@ def test_the_command_asks_and_prints() -> None:
 )
 def test_wrong_options_are_refused(words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert message in Command(capsys).refused("motor", "test", *words)
-
-
-def test_without_yes_nothing_moves(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    for text, message in (("no\n", "not begun"), ("", "no answer")):
-        monkeypatch.setattr("sys.stdin", __import__("io").StringIO(text))
-        code, _, err = Command(capsys)("motor", "test", "--motor", "simulated", "--set", "motor.protocol=vesc")
-        assert code == 2 and message in err
