@@ -7,10 +7,10 @@ import logging
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib import se3
@@ -23,20 +23,20 @@ from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, devic
 from omnid.commands.replay import replay_and_print
 from omnid.config import Config, unused_settings
 from omnid.controller.motor import SIMULATED
+from omnid.engine.graph import nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
-from omnid.navigation_state import NavigationState
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.live import ConnectedRobot, run_live
 from omnid.runs.record import record as record_frames
 from omnid.runs.replay import ReplayOptions
 from omnid.runs.session import attached_rig, motion_topics
-from omnid.simulation import demonstration, lockstep
+from omnid.simulation.demonstration import demonstrate
 from omnid.simulation.paced_robot import PacedRobot
 from omnid.simulation.robot import make_robot
-from omnid.simulation.world_file import WorldOptions, load_world
+from omnid.simulation.world_file import load_world
 from omnid.sinks.files import check_outputs, write_trajectory
 
 
@@ -114,8 +114,7 @@ def simulate(args: argparse.Namespace) -> int:
     --rig FILE                the rig.toml of the cameras; default: a straight rig
     --size PX=512 64..2048    of the images without --rig
     --no-people               leave the people of the world out
-    --light FACTOR=1          factor on the light
-    --other-posters SHARE=0   share of the posters that is exchanged, 0 to 1
+    --light FACTOR=1 0.05..3  factor on the light
     --truth FILE              write the true poses in odom, in the TUM format, at the end
 
     examples:
@@ -125,8 +124,9 @@ def simulate(args: argparse.Namespace) -> int:
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
     config = _settings(args)
     # 1. Run in the world.
-    options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
-    world = load_world(args.world, args.seed, options)
+    world = load_world(args.world, args.seed)
+    people = () if args.no_people else world.people
+    world = replace(world, people=people, brightness=args.light * world.brightness)
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
     paced = PacedRobot(world, robot, config, args.seed)
@@ -138,9 +138,6 @@ def simulate(args: argparse.Namespace) -> int:
         write_trajectory(args.truth, stamps_ns, se3.inverse(T[:1]) @ T)
     log(logging.INFO, f"contacts with obstacles: {paced.contacts}")
     return 0
-
-
-DRIVE_S = 90.0  # Longest drive in simulated time.
 
 
 @command(VERBOSE, QUIET, SETTINGS)
@@ -185,23 +182,12 @@ def _drive(args: argparse.Namespace) -> int:
     place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
     config = settings_of(args, {"places.map": place_map, "navigation.routes": routes})
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
-    world, robot = load_world("room", args.seed), make_robot()
     prepare_kernels()  # which says so where it takes long
-    if not args.quiet:
-        print("a simulated robot is taught an oval and repeats it, in its own\ntime: a minute or two", flush=True)
-    script = demonstration.TeachAndRepeat(lambda line: None if args.quiet else print(line, flush=True))
-    run = lockstep.simulate(world, robot, script, seconds=DRIVE_S, seed=args.seed, config=config)
-    first, second = demonstration.both_paths(run, script.repeated_s)
-    if not cv2.imwrite(str(image), demonstration.draw(world, demonstration.seen_obstacles(run), first, second)):
-        raise OmnidError(f"{image}: cannot be written; name another folder by --output")
-    end = script.end or f"not reached within {DRIVE_S:g} s"
-    print(f"end       {end}, contacts with obstacles: {len(run.contacts)}")
-    print(f"pose      {100 * demonstration.drift_m(run):.1f} cm off at the end")
-    if len(second):
-        off_cm = 100 * demonstration.cross_track_m(first, second)
-        print(f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), {off_cm.max():.1f} at most")
-    print(f"written   {image}, {place_map}")
-    return 0 if script.end == NavigationState.REACHED else 1
+    show = nothing if args.quiet else partial(print, flush=True)
+    show("a simulated robot is taught an oval and repeats it, in its own\ntime: a minute or two")
+    is_reached, lines = demonstrate(image, config, args.seed, show)
+    print(*lines, f"written   {image}, {place_map}", sep="\n")
+    return int(not is_reached)
 
 
 @command(SETTINGS)

@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator, Iterable
+from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.config import Config
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
+from omnid.errors import OmnidError
 from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, draw_ends, draw_plan, sheet_of, with_legend
 from omnid.navigation_state import NavigationState
-from omnid.simulation.lockstep import Moment, Request, SimulatedRun
-from omnid.simulation.world import World, distances_m
+from omnid.simulation.lockstep import Moment, Request, simulate
+from omnid.simulation.robot import make_robot
+from omnid.simulation.world import cross_track_m
+from omnid.simulation.world_file import load_world
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
 ROUTE: Final = "demo"
+DRIVE_S: Final = 90.0  # Longest drive in simulated time.
 STRAIGHT_M, RADIUS_M = 0.8, 0.7  # The oval that is taught: 6 m.
-ARC_STEPS: Final = 15
 LEGEND: Final = (  # colour (BGR) and width [px]
     ("taught path", BLACK, 5),
     ("repeated path", RED, 2),
@@ -32,7 +38,7 @@ LEGEND: Final = (  # colour (BGR) and width [px]
 
 def oval() -> Array:
     """Return the positions (N, 2) [m] in odom of a round drive that ends where it begins."""
-    turns = np.linspace(-0.5 * math.pi, 0.5 * math.pi, ARC_STEPS)
+    turns = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 15)
     right = np.column_stack([STRAIGHT_M + RADIUS_M * np.cos(turns), RADIUS_M + RADIUS_M * np.sin(turns)])
     left = np.array([STRAIGHT_M, 2 * RADIUS_M]) - right
     return np.vstack([(0.0, 0.0), right, left])
@@ -89,45 +95,41 @@ class TeachAndRepeat:
             moment = yield []
 
 
-def both_paths(run: SimulatedRun, repeated_s: float) -> tuple[Array, Array]:
-    """Return the true positions (N, 2), (M, 2) [m] in the world of the first drive and of the repetition."""
+def demonstrate(image: Path, config: Config, seed: int, show: Callable[[str], None]) -> tuple[bool, list[str]]:
+    """Teach a robot an oval, have it repeat that, and draw it in the style of plan.png.
+
+    Return whether it reached the end, and lines with its errors against the truth. show: takes lines while it drives.
+    Raises OmnidError where the image cannot be written.
+    """
+    # 1. The drive, and the true positions (N, 2) [m] of both rounds.
+    world, script = load_world("room", seed), TeachAndRepeat(show)
+    run = simulate(world, make_robot(), script, seconds=DRIVE_S, seed=seed, config=config)
     first, second = (
-        [tick.pose[:2] for tick in run.ticks if (tick.time_s >= repeated_s) == later] for later in (False, True)
+        np.array([tick.pose[:2] for tick in run.ticks if (tick.time_s >= script.repeated_s) == later]).reshape(-1, 2)
+        for later in (False, True)
     )
-    return np.array(first).reshape(-1, 2), np.array(second).reshape(-1, 2)
-
-
-def cross_track_m(first: Array, second: Array) -> Array:
-    """Return the distances (M,) [m] of positions (M, 2) from the line through others (N, 2)."""
-    return distances_m(np.stack([first, np.vstack([first[1:], first[-1:]])], axis=1), second)
-
-
-def seen_obstacles(run: SimulatedRun) -> Array:
-    """Return the obstacles (N, 2) [m] of all scans, where the robot believes them, in the world."""
+    # 2. The image: the world, both rounds, and the obstacles of all scans where the robot believes them.
     directions, found = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(len(azimuths()))]), []
     for scan in run.scans:
         seen = np.isfinite(scan.ranges_m)
         at = scan.ranges_m[seen, None] * directions[seen]
         found.append(se3.apply(run.T_world_base[0] @ scan.T_odom_base, at)[:, :2])
-    return np.vstack([np.zeros((0, 2)), *found])
-
-
-def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray[np.uint8]:
-    """Return an image (H, W, 3) in the style of plan.png: the world, what the robot has seen of it, both paths.
-
-    All are positions (N, 2) [m] in the world. A cell is the darker, the more often something was seen there.
-    """
-    segments = world.obstacles(1.2)
+    obstacles, segments = np.vstack([np.zeros((0, 2)), *found]), world.obstacles(1.2)
     sheet = sheet_of(obstacles, segments.reshape(-1, 2))
     taught, repeated, _, walls = LEGEND
     lines = [Lines(list(segments), *walls[1:]), Lines([first], *taught[1:]), Lines([second], *repeated[1:])]
-    image = draw_plan(sheet, obstacles, np.ones(len(obstacles), np.float32), lines)
-    if len(first):
-        draw_ends(image, sheet, first[0])
-    return with_legend(image, LEGEND)
-
-
-def drift_m(run: SimulatedRun) -> float:
-    """Return the distance [m] of the last pose that was estimated from the true one."""
-    difference = se3.inverse(run.truth_in_odom[-1]) @ run.T_odom_base[-1]
-    return float(np.linalg.norm(difference[:2, 3]))
+    drawn = draw_plan(sheet, obstacles, np.ones(len(obstacles), np.float32), lines)
+    draw_ends(drawn, sheet, first[0])
+    if not cv2.imwrite(str(image), with_legend(drawn, LEGEND)):
+        raise OmnidError(f"{image}: cannot be written; name another folder by --output")
+    # 3. The errors.
+    end = script.end or f"not reached within {DRIVE_S:g} s"
+    drift_m = np.linalg.norm(se3.apply(se3.inverse(run.truth_in_odom[-1]), run.T_odom_base[-1, :3, 3][None])[0, :2])
+    told = [f"end       {end}, contacts with obstacles: {len(run.contacts)}"]
+    told.append(f"pose      {100 * drift_m:.1f} cm off at the end")
+    if len(second):
+        off_cm = 100 * cross_track_m(first, second)
+        told.append(
+            f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), {off_cm.max():.1f} at most"
+        )
+    return script.end == NavigationState.REACHED, told

@@ -14,7 +14,7 @@ posters_per_m = 0.5
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.resources import files
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
@@ -122,29 +122,12 @@ class WorldTable(Struct, frozen=True):
     person: Annotated[tuple[Walker, ...], Many] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class WorldOptions:
-    """Changes of a world between two drives."""
-
-    people: bool = True
-    brightness: float = 1.0
-    other_posters: float = 0.0  # share of the posters that is exchanged
-    posters_seed: int = 0  # of the exchanged ones
-
-    def __post_init__(self) -> None:
-        if not (0.05 <= self.brightness <= 3.0 and 0.0 <= self.other_posters <= 1.0 and self.posters_seed >= 0):
-            raise OmnidError(
-                f"world: brightness {self.brightness:g}, other posters {self.other_posters:g}, seed "
-                f"{self.posters_seed}: give 0.05 to 3, 0 to 1, and 0 or more"
-            )
-
-
 def shipped_worlds() -> list[str]:
     """Return the names of the worlds that come with the program."""
     return sorted(entry.name[:-5] for entry in files("omnid.simulation.worlds").iterdir() if entry.name[-5:] == ".toml")
 
 
-def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) -> World:
+def load_world(name: str, seed: int = 0) -> World:
     """Return a shipped world or that of a file (a name that ends in .toml); raise OmnidError for wrong ones."""
     try:
         if name in shipped_worlds():
@@ -155,13 +138,13 @@ def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) ->
             raise OmnidError(
                 f"world {name!r} is not known; name a file *.toml, or one of {', '.join(shipped_worlds())}"
             )
-        return _painted_world(convert(WorldTable, table_of(data)), name, seed, options or WorldOptions())
+        return _painted_world(convert(WorldTable, table_of(data)), name, seed)
     except ValueError as error:
         raise OmnidError(f"{name}: {error}") from None
 
 
-def _painted_world(world: WorldTable, name: str, seed: int, options: WorldOptions) -> World:
-    """Return the world of a table; same table, seed and options, same world. Raise ValueError for an impossible one."""
+def _painted_world(world: WorldTable, name: str, seed: int) -> World:
+    """Return the world of a table; same table and seed, same world. Raise ValueError for an impossible one."""
     space, (x_m, y_m, heading_deg) = world.space, world.start
     rng = np.random.default_rng([seed, 41])
     # 1. Refuse what cannot be.
@@ -175,12 +158,8 @@ def _painted_world(world: WorldTable, name: str, seed: int, options: WorldOption
         surfaces += _wall(rng, wall, wall.height_m or space.ceiling_m)
     for entry in world.box:
         surfaces += _box(rng, entry)
-    people = tuple(_person(rng, walker) for walker in world.person)  # painted also where they are left out
-    if options.other_posters:
-        surfaces = _exchanged(surfaces, options)
-    start = x_m, y_m, math.radians(heading_deg)
-    people = people if options.people else ()
-    return World(name, tuple(surfaces), people, start, options.brightness * world.light)
+    people = tuple(_person(rng, walker) for walker in world.person)
+    return World(name, tuple(surfaces), people, (x_m, y_m, math.radians(heading_deg)), world.light)
 
 
 def _wall(rng: Random, wall: Wall, height_m: float) -> list[Rectangle]:
@@ -234,14 +213,3 @@ def _box(rng: Random, entry: Box) -> list[Rectangle]:
 def _person(rng: Random, walker: Walker) -> Person:
     walk = asdict(walker)
     return Person(tuple(box(rng, (0.0, 0.0), walk.pop("size_m"), 0.0)), **walk)
-
-
-def _exchanged(surfaces: list[Rectangle], options: WorldOptions) -> list[Rectangle]:
-    """Return the rectangles with a share of the posters exchanged."""
-    rng = np.random.default_rng([options.posters_seed, 42])
-    return [
-        replace(r, texture=textures.poster(rng, (r.texture.shape[1], r.texture.shape[0])))
-        if r.name.startswith("poster") and rng.random() < options.other_posters
-        else r
-        for r in surfaces
-    ]

@@ -29,11 +29,11 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.navigation_state import NavigationState
-from omnid.simulation.demonstration import cross_track_m
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
+from omnid.simulation.rendering.textures import poster
 from omnid.simulation.robot import START_NS, make_robot
-from omnid.simulation.world import World
-from omnid.simulation.world_file import WorldOptions, load_world
+from omnid.simulation.world import World, cross_track_m
+from omnid.simulation.world_file import load_world
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation.disturbed import Fault, Slip, disturbed, simulate
@@ -247,12 +247,19 @@ class Route:
 
 def later(seed: int, number: int, rng: random.Random) -> World:
     """Return the building at another time of the day, with people."""
-    options = WorldOptions(brightness=rng.uniform(0.6, 1.3), other_posters=0.2, posters_seed=number + 1)
+    building, brightness = load_world("building", seed), rng.uniform(0.6, 1.3)
+    posters = np.random.default_rng([number + 1, 42])
+    standing = tuple(  # a fifth of the posters is exchanged
+        replace(face, texture=poster(posters, (face.texture.shape[1], face.texture.shape[0])))
+        if face.name.startswith("poster") and posters.random() < 0.2
+        else face
+        for face in building.standing
+    )
     person = replace(load_world("corridor").people[0], repeat="back and forth", waits_within_m=1.0)
     walking = tuple(
         replace(person, path=path, speed_mps=rng.uniform(0.6, 1.0), start_s=rng.uniform(0.0, 10.0)) for path in DOORS
     )
-    return replace(load_world("building", seed, options), people=walking)
+    return replace(building, standing=standing, people=walking, brightness=brightness * building.brightness)
 
 
 def route_row(taught: Array, driven: SimulatedRun) -> list[Cell]:
