@@ -21,6 +21,7 @@ from calib.models.names import model_in_words
 from calib.rig import Rig
 from calib.rig_file import png, read_rig, write_rig
 from calib.validation import silent
+from drivers.logs.log_reader import LogCameras
 from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
@@ -36,8 +37,6 @@ from omnid.commands.options import (
     command,
     device_opener,
     failed,
-    height_of,
-    log_cameras,
     settings_of,
     warn,
 )
@@ -207,16 +206,27 @@ def drive(args: argparse.Namespace) -> int:
             start = attached_rig(reader, args.logs[0])
     prepare_kernels()
     # 2. Check the rig, or adjust all of it.
-    rig, has_drifted = start, False
-    if not args.only:
-        rig = _adjusted(args, rig)
-    elif "check" in args.only:
-        rig, has_drifted = _checked(args, rig)
+    rig, has_drifted, topics = start, False, log_cameras(args)
+    if "check" in args.only:
+        checked, pairs = check_log(args.logs[0], rig, topics)
+        print(checked)
+        has_drifted = checked.finding.state is not RigState.FITS
+        if args.output is not None:
+            rig, remains = with_upper_corrected(rig, pairs, checked)
+            print(f"{args.output}: {remains}")
+    elif not args.only:
+        adjusted = calibrate_drive(args.logs, rig, topics, lambda line: print(line, file=sys.stderr))
+        print("\n".join(adjusted.lines()))
+        if not adjusted.is_better:
+            print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
+        elif adjusted.is_misfit:
+            warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
+        rig = adjusted.rig if adjusted.is_better else rig
     # 3. Find the height, and the masks; a log that shows none of them is no error but for --only.
     rig, contradiction = _at_height(args, rig)
     if not args.only or "mask" in args.only:
         try:
-            mask = calibrate_mask(args.logs[0], rig, log_cameras(args))
+            mask = calibrate_mask(args.logs[0], rig, topics)
             print(mask)
             rig = mask.rig if mask.share or args.only else rig
         except OmnidError as error:
@@ -233,28 +243,6 @@ def drive(args: argparse.Namespace) -> int:
         print(f"{args.output}: written, {height_of(rig)}")
     is_found = rig is not start or bool(args.only)
     return 0 if is_found and not has_drifted else 1
-
-
-def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
-    """Return the rig that fits the drives best; the same one if none fits them better."""
-    found = calibrate_drive(args.logs, rig, log_cameras(args), lambda line: print(line, file=sys.stderr))
-    print("\n".join(found.lines()))
-    if not found.is_better:
-        print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
-        return rig
-    if found.is_misfit:
-        warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
-    return found.rig
-
-
-def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:
-    """Return the rig, with its upper camera's pose corrected if it is to be written, and whether it had drifted."""
-    found, pairs = check_log(args.logs[0], rig, log_cameras(args))
-    print(found)
-    if args.output is not None:
-        rig, remains = with_upper_corrected(rig, pairs, found)
-        print(f"{args.output}: {remains}")
-    return rig, found.finding.state is not RigState.FITS
 
 
 def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
@@ -340,16 +328,26 @@ def _imported(args: argparse.Namespace) -> Rig:
 
 
 def describe(rig: Rig) -> str:
-    """Return one line about a rig: cameras, topics, baseline, rotation between the cameras, height."""
+    """Return one line about a rig: cameras, baseline, rotation between the cameras, height."""
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(T_upper_lower))))
     lower, upper = (
-        f"{model_in_words(mounted.camera)} {'x'.join(map(str, mounted.camera.size))}" + (f" ({topic})" if topic else "")
-        for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True)
+        f"{model_in_words(mounted.camera)} {'x'.join(map(str, mounted.camera.size))}"
+        for mounted in (rig.lower, rig.upper)
     )
-    delay_ms = 1e3 * rig.times.upper_delay_s
-    late = f"upper exposed {delay_ms:+.1f} ms against its stamps, " if delay_ms else ""
     return (
         f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
-        f"{rotation_deg:.2f} deg, {late}{height_of(rig)}"
+        f"{rotation_deg:.2f} deg, {height_of(rig)}"
     )
+
+
+def height_of(rig: Rig) -> str:
+    """Return the height that a rig states, in words."""
+    if (height_m := rig.height_m()) is None:
+        return "no height of the cameras (--height-m, or `omnid calibrate drive LOG --only height`)"
+    return f"cameras {height_m:.3f} m above the floor"
+
+
+def log_cameras(args: argparse.Namespace) -> LogCameras:
+    """Return the cameras of a log by --lower, --upper, --bits, --rate and --time."""
+    return LogCameras(args.lower, args.upper, int(args.bits), args.rate or 0.0, args.time)

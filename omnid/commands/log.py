@@ -93,8 +93,6 @@ def evaluate_run(args: argparse.Namespace) -> int:
     --tolerance-ms MS=10   largest difference between the stamps of two poses
     --align origin|rigid|scale=origin  the first pose, as evo's --align_origin; rigid: all positions, as its --align;
         scale: these and the estimate's scale, which is printed, as its --align --correct_scale
-    --live FILE            the poses as they were known while driving (replay --map-live-tum), whose errors are printed
-        beside
     --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit the constant pose of another body, and
         print it
 
@@ -102,7 +100,6 @@ def evaluate_run(args: argparse.Namespace) -> int:
       eval est.txt truth.txt
       eval est.txt imu_truth.csv --frame auto
       eval est.txt truth.txt --align rigid --json
-      eval map.txt truth.txt --live live.txt
     """
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
     # The body of the truth; unasked, half of the drive must show a difference that halves the error of all of it.
@@ -116,15 +113,12 @@ def evaluate_run(args: argparse.Namespace) -> int:
         error_m = evaluate(estimate, of_rig, tolerance_s, args.align).ate_rmse_m
         if error_m < metrics.ate_rmse_m / 2:
             warn(f"{args.truth}: {frame}: with that the position error is {1e3 * error_m:.1f} mm: --frame auto")
-    live = evaluate(read_tum(args.live), truth, tolerance_s, args.align) if args.live else None
     if args.json:
         known = {"fitted_frame": str(frame), "fitted_unknowns": frame.freedom} if frame and is_fitted else {}
-        print_json(asdict(metrics) | known | ({} if live is None else {"live": asdict(live)}))
+        print_json(asdict(metrics) | known)
         return 0
     if frame is not None and is_fitted:
         print(f"{args.truth}: {frame}")
         print(f"unknowns of it that were fitted to these poses: {frame.freedom}; the errors are optimistic")
     print(metrics)
-    if live is not None:
-        print(f"as known while driving, of {args.live}\n{live}")
     return 0

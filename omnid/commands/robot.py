@@ -32,7 +32,7 @@ def arm(args: argparse.Namespace) -> int:
       arm
       arm --robot rover --connect tcp/robot:7447
     """
-    with _connected(args) as robot:
+    with Robot(settings=settings_of(args).bus) as robot:
         answer = robot.driver().arm()
     print(f"{robot.name} is {answer.text}" if answer.done else f"{robot.name} refuses: {answer.text}")
     return int(not answer.done)
@@ -111,7 +111,7 @@ def teach(args: argparse.Namespace) -> int:
       route teach morning --replace
     """
     name = route_name(args.name)
-    with _connected(args) as robot:
+    with Robot(settings=settings_of(args).bus) as robot:
         # 1. Begin.
         driver = robot.driver()
         granted(robot, driver.route(f"teach {name} replace" if args.replace else f"teach {name}"))
@@ -164,7 +164,7 @@ def end_route(args: argparse.Namespace) -> int:
 
 def ask(args: argparse.Namespace, *requests: Callable[[Driver], Answer]) -> int:
     """Send requests to the robot, one after the other, and print the last answer. Raise OmnidError with a refusal."""
-    with _connected(args) as robot:
+    with Robot(settings=settings_of(args).bus) as robot:
         driver = robot.driver()
         answers = [granted(robot, request(driver)) for request in requests]
     print(answers[-1])
@@ -178,10 +178,6 @@ def granted(robot: Robot, answer: Answer) -> str:
     return answer.text
 
 
-def _connected(args: argparse.Namespace) -> Robot:
-    return Robot(settings=settings_of(args).bus)
-
-
 def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int:
     """Ask for a drive and show it until its end, or with --no-wait until the robot has accepted it.
 
@@ -189,7 +185,7 @@ def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int
     other ends of this program cancel it, also while the robot has not answered yet.
     """
     report, shown, is_terminal = NavigationReport(), "", sys.stdout.isatty()
-    with _connected(args) as robot:
+    with Robot(settings=settings_of(args).bus) as robot:
         driver = robot.driver()
         try:
             with handle_stop_signals(signal.default_int_handler):

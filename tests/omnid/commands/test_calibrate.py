@@ -18,7 +18,6 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from omnid import replay
-from omnid.calibration.live_boards import LiveBoards, PairOutcome, status
 from omnid.cli import main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
@@ -126,42 +125,22 @@ def test_views_of_one_camera_are_used_and_exchanged_cameras_are_a_warning(
     assert abs(found.baseline_m - TRUTH.baseline_m) < 4 * found.covariance.sigma("baseline") < 8e-3
 
 
-def bad(folder: Path, made: Path, kind: str) -> Path:
-    """Return invalid input: a folder of three pairs with a fault."""
-    blank = np.full((480, 480), 90, np.uint8)
-    for name in ("lower", "upper"):
-        for k in range(3):
-            shutil.copy(folder / f"{name}_{k:02d}.png", made)
-    match kind:
-        case "blank":
-            for path in made.glob("upper_*"):
-                cv2.imwrite(str(path), blank)
-        case "one side":
-            for path in made.glob("upper_*"):
-                path.unlink()
-    return made
-
-
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images"),
-        ("one side", "no images upper_*"),
-    ],
-)
-def test_invalid_input_is_one_line_and_exit_code_2(
-    folder: Path, tmp_path: Path, kind: str, message: str, capsys: pytest.CaptureFixture[str]
+def test_images_without_a_board_are_one_line_and_exit_code_2(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("-o", tmp_path / "rig.toml", bad(folder, tmp_path, kind)) == 2
+    for k in range(3):
+        shutil.copy(folder / f"lower_{k:02d}.png", tmp_path)
+        cv2.imwrite(str(tmp_path / f"upper_{k:02d}.png"), np.full((480, 480), 90, np.uint8))
+    assert run("-o", tmp_path / "rig.toml", tmp_path) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert message in line and not (tmp_path / "rig.toml").exists()
+    assert "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images" in line
+    assert not (tmp_path / "rig.toml").exists()
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--corners", "6x5"], "--board checkerboard: expected --corners, --square-mm"),
-        (["--corners", "6x5", "--square-mm", "30", "--tags", "2x2"], "no options of another kind"),
         (["--corners", "6x5", "--square-mm", "30"], "add --view mirror or direct"),
         (["--board", "aprilgrid", "--tags", "6x6", "--tag-mm", "80", "--tag-spacing", "24"], "Kalibr's tagSpacing"),
     ],
@@ -189,34 +168,13 @@ def larger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return render_pairs(rig_of(640), tmp_path_factory.mktemp("pairs"), LIVE_PAIRS)
 
 
-def test_a_pair_is_kept_where_the_board_stands_still_at_a_new_place(larger: Path) -> None:
-    boards = LiveBoards(BOARD)
-    first, second = (tuple(image(larger, f"{side}_{name}") for side in ("lower", "upper")) for name in ("00", "01"))
-    empty = np.zeros_like(first[0])
-    seen = [
-        boards.process(pair, need_still=True)
-        for pair in (first, first, first, second, second, (empty, empty), (first[0], empty))
-    ]
-    assert seen == [
-        PairOutcome.MOVING,
-        PairOutcome.KEPT,
-        PairOutcome.SEEN_BEFORE,
-        PairOutcome.MOVING,
-        PairOutcome.KEPT,
-        PairOutcome.NO_BOARD,
-        PairOutcome.ONE_CAMERA,
-    ]
-    assert boards.pairs == 2 and boards.missing()[0] == "13 more positions"
-    values = status(boards, seen[-1]).values
-    assert len(values["lower_coverage"]) == len(values["upper_coverage"]) == 36 and values["pairs"] != "0"
-    boards.close()
-
-
 def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
     larger: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     omnid, kept = Command(capsys), tmp_path / "kept"
-    pairs = [tuple(image(larger, f"{side}_{name}") for side in ("lower", "upper")) for name in ("00", "00", "01", "01")]
+    names = ("00", "00", "00", "01", "01")  # moving, kept, seen before, moving, kept
+    pairs = [tuple(image(larger, f"{side}_{name}") for side in ("lower", "upper")) for name in names]
+    pairs += [(np.zeros_like(pairs[0][0]),) * 2, (pairs[0][0], np.zeros_like(pairs[0][0]))]  # no board, one camera
     monkeypatch.setattr("omnid.commands.calibrate.device_opener", lambda _: lambda _: io.BytesIO())
     monkeypatch.setattr("omnid.commands.calibrate.newest_pairs", lambda *_: pairs)
     words = ("calibrate", "live", kept, *OPTIONS, "--set", f'bus.listen=["{free_endpoint()}"]')
@@ -304,7 +262,7 @@ def kalibr(tmp_path: Path) -> Path:
 def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert import_rig(kalibr, "-o", tmp_path / "rig.toml") == 0
     (line,) = capsys.readouterr().out.splitlines()
-    assert "lower omni 768x770 (/lower/image_raw), upper omni 768x770" in line
+    assert "lower omni 768x770, upper omni 768x770" in line
     assert "baseline 201.2 mm, upper rotated by 17.4" in line and "no height of the cameras (--height-m" in line
     assert import_rig(kalibr, "--lower", "cam1", "-o", tmp_path / "swapped.toml", "--height-m", 0.8) == 0
     swapped = read_rig(tmp_path / "swapped.toml")
@@ -335,7 +293,6 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     ("words", "message"),
     [
         (("none.yaml", "-o", "no/rig.toml"), "there is no folder"),
-        (("k.yaml", "-o", "."), "expected a file to write, found a folder"),
         (("none.yaml", "-o", "rig.toml"), "cannot be read"),
         (("k.yaml", "-o", "k.yaml"), "that is read as well"),
         (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "Kalibr's state them"),
