@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
@@ -25,13 +25,6 @@ ANSWER_S: Final = MOVE_S  # A stop is repeated for this time: a busy computer de
 BEFORE: Final = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair
 away from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to
 begin: """
-
-
-class Seen(NamedTuple):
-    """The wheel that a motor turned, and in which direction a positive command turned it."""
-
-    side: str
-    forward: bool
 
 
 def tested_drive(
@@ -70,15 +63,21 @@ def tested_drive(
                 time.sleep(REST_S)
 
         turned_deg = math.degrees(speed_mps * MOVE_S / drive.wheel_radius_m)
-        first, second = (_seen(channel, turned_deg, motion, ask) for channel in (1, 2))
-    if first.side == second.side:
-        raise OmnidError(f"both motors turned the {first.side} wheel, which cannot be: begin again")
-    left, right = (first, second) if first.side == "left" else (second, first)
-    return replace(drive, swapped=first.side == "right", reverse_left=not left.forward, reverse_right=not right.forward)
+        seen = [_seen(channel, turned_deg, motion, ask) for channel in (1, 2)]
+    first, forwards = seen[0][0], dict(seen)
+    if len(forwards) == 1:
+        raise OmnidError(f"both motors turned the {first} wheel, which cannot be: begin again")
+    reverse_left, reverse_right = (not forwards[side] for side in ("left", "right"))
+    return replace(drive, swapped=first == "right", reverse_left=reverse_left, reverse_right=reverse_right)
 
 
-def _seen(channel: int, turned_deg: float, motion: Callable[[int], None], ask: Callable[[str], str]) -> Seen:
-    """Turn one motor, and ask what moved; turned_deg: by which its wheel turns one way, where the gear is right."""
+def _seen(
+    channel: int, turned_deg: float, motion: Callable[[int], None], ask: Callable[[str], str]
+) -> tuple[str, bool]:
+    """Turn one motor; return the side of the wheel that moved, and whether a positive command turned it forwards.
+
+    turned_deg: by which the wheel turns one way, where the gear is right.
+    """
     question = (
         f"Motor {channel} turned its wheel by {turned_deg:.0f} deg and back, or motor.drive.gear is wrong. Name the "
         "wheel that moved (l left, r right, b both, n none, "
@@ -101,7 +100,7 @@ def _seen(channel: int, turned_deg: float, motion: Callable[[int], None], ask: C
     answer = ""
     while answer not in ("y", "n"):
         answer = ask(f"Did the {side} wheel turn forwards first, as for driving forwards (y or n)? ")[:1].lower()
-    return Seen(side, answer == "y")
+    return side, answer == "y"
 
 
 def _move(motor: MotorDriver, config: MotorSettings, velocity_mps: float, yaw_rate_radps: float) -> None:

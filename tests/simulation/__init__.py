@@ -4,7 +4,7 @@ from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, box, posters
 from tests.simulation.builders import corridor, room, wall
-from tests.simulation.logs import camchain, render, tum, write_log
+from tests.simulation.logs import render, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build
 from tests.simulation.rigs import make_rig
 
@@ -17,7 +17,6 @@ __all__ = [
     "SimulatedRun",
     "box",
     "build",
-    "camchain",
     "corridor",
     "make_rig",
     "posters",

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.models.camera import Array, OmniCamera
-from calib.models.unified import UnifiedCamera
+from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from drivers.motion import GyroSample, MotionSample, WheelSample
@@ -138,7 +137,10 @@ def write_log(
         skews = readout.skew_ns(len(poses)).astype(np.int64)
     sensor = sensor or Sensor()
     exposures = [MountedSensor(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
-    _write_rigs(folder, rig)
+    if isinstance(rig.lower.camera, MirrorCamera):
+        write_rig(folder / "nominal.toml", nominal_rig(rig))
+    else:
+        write_rig(folder / "rig.toml", rig)
 
     def jpeg(pair: int, camera: int) -> bytes:
         exposed = exposures[camera].expose(ideal_image(pair, camera), rng)
@@ -149,17 +151,6 @@ def write_log(
     # log.mcap appears only when it is complete.
     _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images)
     (folder / "log.mcap.part").replace(folder / "log.mcap")
-
-
-def _write_rigs(folder: Path, rig: Rig) -> None:
-    """Write the files that describe the rig."""
-    if isinstance(rig.lower.camera, MirrorCamera):
-        write_rig(folder / "nominal.toml", nominal_rig(rig))
-        return
-    # Kalibr's file holds unified cameras only.
-    if isinstance(rig.lower.camera, UnifiedCamera):
-        (folder / "camchain.yaml").write_text(camchain(rig))
-    write_rig(folder / "rig.toml", rig)
 
 
 def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], images: Images) -> None:
@@ -189,39 +180,6 @@ def tum(stamps_ns: Stamps, poses: Array) -> str:
         values = " ".join(f"{x:.9f}" for x in (*T[:3, 3], *se3.quaternion(T[:3, :3])))
         rows.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {values}\n")
     return "".join(rows)
-
-
-def camchain(rig: Rig) -> str:
-    """Return the rig as Kalibr's camchain.yaml; T_cam_imu is T_cam_rig."""
-    lower, upper = _kalibr("cam0", rig.lower, rig.topics[0]), _kalibr("cam1", rig.upper, rig.topics[1])
-    T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    return "".join([*lower, *upper, *_matrix("T_cn_cnm1", T_upper_lower)])
-
-
-def _kalibr(name: str, mounted: MountedCamera, topic: str) -> list[str]:
-    camera = _unified(mounted.camera)
-    numbers = (camera.xi, *camera.focal, *camera.center)
-    has_distortion = any(camera.distortion)
-    return [
-        f"{name}:\n  camera_model: omni\n  intrinsics: [{', '.join(map(_number, numbers))}]\n",
-        f"  distortion_model: {'radtan' if has_distortion else 'none'}\n",
-        f"  distortion_coeffs: [{', '.join(map(_number, camera.distortion)) if has_distortion else ''}]\n",
-        f"  resolution: [{camera.size[0]}, {camera.size[1]}]\n  rostopic: {topic}\n",
-        *_matrix("T_cam_imu", mounted.T_cam_rig),
-    ]
-
-
-def _matrix(name: str, T: Array) -> list[str]:
-    return [f"  {name}:\n", *(f"  - [{', '.join(map(_number, row))}]\n" for row in T)]
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
-
-
-def _unified(camera: OmniCamera) -> UnifiedCamera:
-    assert isinstance(camera, UnifiedCamera), "Kalibr's file holds unified cameras only"
-    return camera
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from drivers.logs.log_reader import LogReader
-from omnid.cli import main
 from omnid.config import Config, load_config
 from omnid.formats.place_file import write_places
 from tests.drivers.logs.mcap_logs import LOWER, START_NS, Entry, pairs, text, write_log
@@ -162,9 +161,8 @@ def omap(tmp_path: Path) -> Path:
     return tmp_path / "a.omap"
 
 
-def test_show_prints_the_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["map", "show", str(omap)]) == 0
-    printed = capsys.readouterr().out
+def test_show_prints_the_sizes(omap: Path, omnid: Command) -> None:
+    printed = omnid("map", "show", omap).out
     for line in (
         "sessions     2",
         "keyframes    12; 3 were dropped",
@@ -175,11 +173,10 @@ def test_show_prints_the_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -
         assert line in printed
 
 
-def test_export_writes_the_files_and_names_them(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_writes_the_files_and_names_them(omap: Path, omnid: Command) -> None:
     a = {end: omap.parent / f"a.{end}" for end in ("ply", "png", "yaml", "pgm")}
-    words = ["--ply", str(a["ply"]), "--plan", str(a["png"]), "--grid", str(a["yaml"]), "--cell", "0.1"]
-    assert main(["map", "export", str(omap), *words]) == 0
-    printed = capsys.readouterr().out
+    words = ("--ply", a["ply"], "--plan", a["png"], "--grid", a["yaml"], "--cell", 0.1)
+    printed = omnid("map", "export", omap, *words).out
     assert all(str(path) in printed for path in a.values())
     assert len(read_ply(a["ply"]).xyz) > 50 and a["pgm"].read_bytes().startswith(b"P5\n")
     assert "resolution: 0.1\n" in a["yaml"].read_text() and "image: a.pgm\n" in a["yaml"].read_text()
@@ -188,20 +185,9 @@ def test_export_writes_the_files_and_names_them(omap: Path, capsys: pytest.Captu
     assert np.count_nonzero(plan[..., 0] > plan[..., 2] + 100) > 20
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["export", "{}"], "nothing to write"),
-        (["export", "{}", "--grid", "{}.png"], "expected a name that ends in .yaml"),
-        (["show", "{}.none"], "cannot read the map"),
-    ],
-)
-def test_mistakes_are_one_line(omap: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_one_line(omap: Path, omnid: Command) -> None:
     before = omap.read_bytes()
-    try:
-        code = main(["map", *(word.format(omap) for word in words)])
-    except SystemExit as ended:
-        code = int(str(ended.code))
-    error = capsys.readouterr().err
-    assert code == 2 and message in error and error.count("\n") == 1
+    assert "nothing to write" in omnid.refused("map", "export", omap)
+    assert "expected a name that ends in .yaml" in omnid.refused("map", "export", omap, "--grid", f"{omap}.png")
+    assert "cannot read the map" in omnid.refused("map", "show", f"{omap}.none")
     assert omap.read_bytes() == before and [path.name for path in omap.parent.iterdir()] == ["a.omap"]

@@ -291,7 +291,7 @@ def test_a_motion_lasts_as_long_as_its_key_is_repeated_at_a_share_of_the_limits(
     assert stick.arm_asked and stick.stop_asked and stick.quit and not stick.commands(0.0)
 
 
-@pytest.mark.parametrize("key", [b" ", b"x", b"\x1b", b"\x1b[1;2A", b"\x1bOQ"])
+@pytest.mark.parametrize("key", [b" ", b"x", b"\x1b[1;2A"])
 def test_any_other_key_ends_the_motion_and_means_nothing_else(stick: Stick, key: bytes) -> None:
     stick.press(UP + key, 0.0)
     assert stick.twist(0.0) == (0.0, 0.0) and stick.commands(0.0)
@@ -300,7 +300,7 @@ def test_any_other_key_ends_the_motion_and_means_nothing_else(stick: Stick, key:
     assert stick.stop_asked, "also after the first part of a key"
 
 
-@pytest.mark.parametrize("parts", [(b"\x1b", b"[A"), (b"\x1b[", b"A"), (b"x\x1b", b"[A"), (b"\x1bO", b"A")])
+@pytest.mark.parametrize("parts", [(b"\x1b", b"[A"), (b"\x1bO", b"A")])
 def test_an_arrow_that_comes_in_parts_drives_and_does_not_arm(stick: Stick, parts: tuple[bytes, ...]) -> None:
     for part in parts:
         stick.press(part, 0.0)
