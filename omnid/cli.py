@@ -119,7 +119,8 @@ def _did_you_mean(word: str, known: Sequence[str]) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 128 + a signal."""
-    bound_image_size()
+    # OpenCV reads it when it is loaded: it refuses larger image files; by drivers.frame.MAX_PIXELS, which loads OpenCV.
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
     limit_blas_threads()
     words = list(sys.argv[1:] if argv is None else argv)
     if _completes():
@@ -153,16 +154,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         log(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
         _discard_stdout()
         return WRONG_INPUT
-
-
-def bound_image_size() -> None:
-    """Let OpenCV refuse image files that would take much memory, of any format.
-
-    OpenCV reads the variable when it is loaded, so this comes before the first import of it. The value is
-    drivers.frame.MAX_PIXELS, whose module loads OpenCV. `import omnid` leaves the environment of a program as it is:
-    there, frames are bounded by their headers (drivers/frame.py).
-    """
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
 
 
 def limit_blas_threads() -> None:

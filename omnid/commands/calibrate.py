@@ -309,22 +309,19 @@ def import_rig(args: argparse.Namespace) -> int:
 
 
 def _imported(args: argparse.Namespace) -> Rig:
-    files = bool(args.transform or args.view)
-    if args.equirectangular:
-        if args.baseline is None or args.camchain or args.lower or args.upper or files:
-            raise OmnidError("--equirectangular: expected --baseline METRES beside it, and no file")
+    named = ("camchain", "lower", "upper", "equirectangular", "transform", "baseline", "view")
+    given = {name for name in named if vars(args)[name] is not None}
+    if given == {"equirectangular", "baseline"}:
         return stacked_rig(args.equirectangular, args.baseline)
-    if args.camchain is not None:
-        if files or args.baseline is not None:
-            raise OmnidError("--transform, --baseline and --view belong to files of OCamCalib: Kalibr's state them")
+    if "camchain" in given <= {"camchain", "lower", "upper"}:
         return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, warn)
-    if not (args.lower and args.upper and (args.transform or args.baseline is not None)):
-        raise OmnidError(
-            "calibrate import: expected a Kalibr camchain.yaml, or two files of OCamCalib as --lower and --upper with "
-            "--transform FILE or --baseline METRES"
-        )
-    T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
-    return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", warn)
+    if given - {"view"} in ({"lower", "upper", "transform"}, {"lower", "upper", "baseline"}):
+        T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
+        return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", warn)
+    raise OmnidError(
+        "calibrate import: expected a Kalibr camchain.yaml; or two files of OCamCalib as --lower and --upper, with "
+        "--transform FILE or --baseline METRES; or --equirectangular WIDTHxHEIGHT with --baseline METRES"
+    )
 
 
 def describe(rig: Rig) -> str:

@@ -295,9 +295,8 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         (("none.yaml", "-o", "no/rig.toml"), "there is no folder"),
         (("none.yaml", "-o", "rig.toml"), "cannot be read"),
         (("k.yaml", "-o", "k.yaml"), "that is read as well"),
-        (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "Kalibr's state them"),
-        (("-o", "rig.toml"), "expected a Kalibr camchain.yaml, or two files of OCamCalib"),
-        (("--equirectangular", "1920x960", "-o", "rig.toml"), "expected --baseline METRES"),
+        (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "expected a Kalibr camchain.yaml"),
+        (("--equirectangular", "1920x960", "-o", "rig.toml"), "with --baseline METRES"),
     ],
 )
 def test_invalid_requests_fail_before_files_are_written(

@@ -101,7 +101,6 @@ def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
 SIZE = 192
 SQUARES, SQUARE_M, DISTANCE_M = 4, 0.36, 1.1
 RIGS = {
-    "straight": make_rig(size=SIZE),
     "misaligned": make_rig(
         size=SIZE,
         scale=0.9,
