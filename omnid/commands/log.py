@@ -20,7 +20,6 @@ from omnid.recordings.truth_frame import find_truth_frame
 from omnid.utc import utc
 
 BROKEN = "cut or corrupt"
-MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
 @command(RATE)
@@ -40,7 +39,7 @@ def info(args: argparse.Namespace) -> int:
         try:
             log = open_log(path, args.rate or 0.0)
         except DriverError as error:
-            failed(plain(str(error), MAX_LINE))
+            failed(plain(str(error)))
             code = 2
             continue
         print("\n" * bool(number), end="")
@@ -63,12 +62,12 @@ def _show(log: Log) -> None:
     listed = ", ".join(f"{name} ({_bytes(len(data))})" for name, data in log.attachments().items())
     entries = {"log": str(log.path), "size": _bytes(log.size_bytes), "state": state, "time": time}
     entries |= {"messages": str(counts.total()), "attachments": listed or "none"}
-    print_entries({name: plain(text, MAX_LINE) for name, text in entries.items()})
+    print_entries({name: plain(text) for name, text in entries.items()})
     rows = []
     for number, (name, kind) in enumerate(log.topics.items()):
         span_s = 1e-9 * np.ptp(logged_ns[log.topic == number]) if counts[name] > 1 else 0.0
         rate = f"{(counts[name] - 1) / span_s:.2f}" if span_s else "-"
-        rows.append((plain(name, MAX_LINE), plain(kind) or "-", counts[name], rate))
+        rows.append((plain(name), plain(kind) or "-", counts[name], rate))
     rows.sort()
     if rows:
         wide, wide_kind = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:2])

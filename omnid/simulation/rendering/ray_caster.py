@@ -28,10 +28,10 @@ Floats = NDArray[np.float32]
 TILE_PX = 32  # samples along a tile's side
 RAY_CHUNK = 1 << 18  # Pixels lifted at once, which bounds memory.
 KEPT = 6  # Number of cameras whose rays are kept, and of scenes whose textures are.
-CONE_MARGIN_RAD = 1e-3  # Added to the half angle of a tile's cone: rounding of float32 rays.
+# Rounding of float32 rays: of angles [rad] near the axis of a cone, and as a share of distances.
+ROUNDING = 2 * float(np.sqrt(np.finfo(np.float32).eps))
 # Guards against division by zero at a rectangle through the viewpoint [m].
 MIN_DISTANCE_M = np.finfo(float).eps
-MARGIN_M = 1e-4  # Subtracted from the least distance of a rectangle: rounding of float32 rays.
 SMALLEST_PX = 8
 
 
@@ -125,7 +125,7 @@ def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
     axes[full] = np.add.reduceat(rays.astype(float), first)
     axes[full] /= np.linalg.norm(axes[full], axis=1, keepdims=True)
     cosines = np.einsum("ij,ij->i", rays, np.repeat(axes, counts, axis=0))
-    angles[full] = np.arccos(np.clip(np.minimum.reduceat(cosines, first), -1, 1)) + CONE_MARGIN_RAD
+    angles[full] = np.arccos(np.clip(np.minimum.reduceat(cosines, first), -1, 1)) + ROUNDING
     return axes, angles
 
 
@@ -187,7 +187,7 @@ def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Ar
     rows[:, :-1, -1] = np.einsum("rij,rj->ri", n_u_v, from_origin)
     rows[:, -1, 0] = [r.brightness for r in rectangles]
     rows[:, -1, 1] = [r.texture.size for r in rectangles] / np.linalg.norm(edges[:, 1:], axis=2).prod(axis=1)
-    rows[:, -1, 2] = nearest_m - MARGIN_M
+    rows[:, -1, 2] = nearest_m - ROUNDING * np.abs(nearest_m)
     return rows.astype(np.float32)
 
 
