@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 from msgspec import Meta
 
@@ -39,13 +39,6 @@ class Deadlines:
     ] = 0.25
 
 
-class Rule(NamedTuple):
-    """One reason to stop the wheels."""
-
-    reason: str  # a few words
-    disarms: bool  # a fault: with controller.arming = "manual" the wheels stay stopped after it until cmd/arm
-
-
 ENDS: Final = "the run ends"
 ASKED: Final = "a stop was asked for"
 AWAITED: Final = "waiting for the motor"
@@ -61,22 +54,17 @@ IDLE: Final = "no command"
 COMMAND_STALE: Final = "the command is stale"
 
 
+# These disarm: with controller.arming = "manual" the wheels stay stopped after them until cmd/arm.
+FAULTS: Final = (
+    *(CLIFF, BUMPER, AWAITED, FAILED, STOPPED, MOTOR_FAULT, BATTERY_EMPTY),
+    *(OVERLOADED, NO_POSE, POSE_STALE, POSE_LOST, POSE_RESET, POSE_UNSURE),
+    *(NOT_FOLLOWED, NOT_SEEN, NOT_COMMANDED, *CONFLICTS),
+)
 # The first rule that holds is reported. The end and a stop are no faults: nothing follows the end, and a stop latches
 # in any mode. A heading that jumps is none: odometry has closed a gap, and only setpoints from before are void.
-RULES: Final = (
-    Rule(ENDS, False),
-    Rule(ASKED, False),
-    *(Rule(reason, True) for reason in (CLIFF, BUMPER, AWAITED, FAILED, STOPPED, MOTOR_FAULT, BATTERY_EMPTY)),
-    *(Rule(reason, True) for reason in (OVERLOADED, NO_POSE, POSE_STALE, POSE_LOST, POSE_RESET, POSE_UNSURE)),
-    *(Rule(reason, True) for reason in (NOT_FOLLOWED, NOT_SEEN, NOT_COMMANDED, *CONFLICTS)),
-    Rule(POSE_JUMPED, False),
-    Rule(NOT_ARMED, False),
-    Rule(IDLE, False),
-    Rule(COMMAND_STALE, False),
-)
-FAULTS: Final = tuple(rule for rule in RULES if rule.disarms)
+RULES: Final = (ENDS, ASKED, *FAULTS, POSE_JUMPED, NOT_ARMED, IDLE, COMMAND_STALE)
 
 
-def stop_reason(holding: Collection[str], rules: Iterable[Rule] = RULES) -> str:
+def stop_reason(holding: Collection[str], rules: Iterable[str] = RULES) -> str:
     """Return the first reason of the table among those that hold; empty where the wheels may turn."""
-    return next((rule.reason for rule in rules if rule.reason in holding), "")
+    return next((reason for reason in rules if reason in holding), "")

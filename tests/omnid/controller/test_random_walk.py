@@ -50,7 +50,7 @@ HOLD_NS = round(SETTINGS.deadlines.command_s * 1e9)
 LEAD_RAD = LIMITS.yaw_rate_radps * 0.15 + LIMITS.yaw_rate_radps**2 / (2 * LIMITS.yaw_acceleration_radps2)
 SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", "c"), ("autopilot", "d"))
 TINY = 1e-9
-FAULTS = frozenset(rule.reason for rule in safety_rules.FAULTS)
+FAULTS = frozenset(safety_rules.FAULTS)
 COLLISION = CollisionSettings()
 SCANS = ("free", "free", "free", "ahead", "behind", "unknown", "random", "person", "none")
 SLOW_SHARE = SETTINGS.trust.degraded_speed
@@ -395,7 +395,7 @@ def nearer(before: float, now: float) -> bool:
 
 def walk(seed: int, mode: str, ticks: int) -> None:
     seen = Walk(seed, mode).run(ticks)
-    reasons = {rule.reason for rule in safety_rules.RULES} - {safety_rules.ENDS, safety_rules.NO_POSE}
+    reasons = set(safety_rules.RULES) - {safety_rules.ENDS, safety_rules.NO_POSE}
     if mode == AUTOMATIC:
         reasons -= {safety_rules.NOT_ARMED}
     reasons |= {BLOCKED, MOVING, NEAR, SCAN_STALE, UNKNOWN}
