@@ -194,8 +194,7 @@ class MappingConfig:
     rate_hz: Annotated[
         float,
         Meta(ge=0, le=1000),
-        "pairs a second that enter the map, each with dense stereo; 0: all; "
-        "keyframes only while no client receives and no log records the cloud of a live run",
+        "pairs a second that enter the map, each with dense stereo; 0: all; of a live run only keyframes",
     ] = 5.0
     voxel_m: Annotated[float, Meta(ge=0.001, le=10), "edge of a voxel, m"] = 0.05
     max_voxels: int = 180_000  # largest number of voxels, of 52 bytes each

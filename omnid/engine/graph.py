@@ -8,16 +8,19 @@ Where streams of several threads merge, only the inline order is fixed.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from types import FrameType
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from omnid.core.nanoseconds import S_PER_NS
+from omnid.engine.process import handle_stop_signals
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.engine.threads import POLL_S
 
@@ -168,7 +171,7 @@ class Graph:
         self._inboxes: dict[str, _Inbox] = {}  # by thread
         self.failed: set[str] = set()  # names of stages
         self._errors: list[BaseException] = []
-        self._is_stopped = False
+        self.signal = 0  # number of the signal that ended the run
         self._open_sources = 0
 
     # The wiring.
@@ -235,7 +238,7 @@ class Graph:
             for read in () if self.threaded else self._readers.values():
                 read()
             self._join(threads)
-        except BaseException as error:  # from the caller's signal handler, or no thread could be started
+        except BaseException as error:  # from a stage that runs inline, or no thread could be started
             self._errors.insert(0, error)
             self._join(threads)
         # 3. What went wrong.
@@ -244,12 +247,18 @@ class Graph:
         if self._errors:
             raise self._errors[0]
 
-    def stop(self) -> None:
-        """End the sources and process what is in the inboxes.
+    def signals(self) -> AbstractContextManager[None]:
+        """Return a context in which a first SIGINT, SIGTERM or SIGHUP ends the sources: what is in the inboxes is done.
 
-        Takes no lock, so any thread or signal handler may call it.
+        A second one ends the process at once; the controller process then stops the wheels, as after any such end.
         """
-        self._is_stopped = True
+
+        def handle(number: int, _: FrameType | None) -> None:
+            if self.signal:
+                os._exit(128 + number)
+            self.signal = number
+
+        return handle_stop_signals(handle)
 
     def settle(self) -> None:
         """Wait until all messages have been processed, or the run ends: for a source whose time is stopped meanwhile.
@@ -262,8 +271,8 @@ class Graph:
 
     @property
     def is_stopping(self) -> bool:
-        """True after a stop or a failure."""
-        return self._is_stopped or bool(self._errors)
+        """True after a signal or a failure."""
+        return bool(self.signal or self._errors)
 
     @contextmanager
     def watched(self, name: str) -> Iterator[None]:
@@ -305,7 +314,7 @@ class Graph:
             inlet.push(END)
 
     def _join(self, threads: list[threading.Thread]) -> None:
-        """Wait for the threads that were started; pass a stop or a failure on to the sources."""
+        """Wait for the threads that were started; pass a signal or a failure on to the sources."""
         for thread in threads:
             while thread.is_alive():
                 thread.join(POLL_S)

@@ -163,7 +163,7 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         )
         prepare_kernels()
         import_module("scipy.sparse.linalg")  # what the first loop needs
-        outputs.enter_context(session.signals())
+        outputs.enter_context(graph.signals())
         # 2. The connections, and the stages between them.
         health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
         run_places = _join(session, FrontEnd(geometry, config, health), robot, report)
@@ -221,7 +221,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         )
 
     # 3. The stages, and the navigation with its requests and files.
-    requests, map_is_read = Requests(graph), graph.inlet(1)
+    requests = Requests(graph)
     if rig.height_m(config.obstacles.scan.floor_m) is None:
         session.warn(
             "the rig states no height of the cameras: the floor is looked for in the images; "
@@ -237,7 +237,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         navigation = Navigation(requests, states, PlannerDrive(controller, bus.answer), bus.answer)
-    inputs = Inputs(frames, run_places, controller, navigation, map_is_read, config.live.cloud_s)
+    inputs = Inputs(frames, run_places, controller, navigation, config.live.cloud_s)
     stages = wire(config, inputs, front_end, graph, outputs)
 
     # 4. What comes from the bus: samples of gyro and wheels, unless they come with the images of a log or of a
@@ -270,7 +270,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         sources=SOURCES,
         is_unique=lambda: bus.is_unique,
         navigate=ask if controller is not None else None,
-        save_map=None if saves is None else lambda id: saves.push(SaveMap(id)),
+        save_map=(lambda id: saves[0].push(SaveMap(id))) if saves else None,
         sensors=sensors,
         why_not=why_not,
         report=session.warn,
@@ -309,7 +309,6 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
     )
 
     def give_status() -> None:
-        map_is_read.push(recorder is not None or bus.is_received("cloud"))
         reports.push(StatusReport(clock.monotonic_ns(), collect()))
 
     session.every(config.live.status_s, give_status, "status")

@@ -50,7 +50,6 @@ class RunPlaces:
             raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")
         # 1. The map: that of the file, a new one, or none. It must fit the rig, and the panoramas of this run.
         path = self._path = Path(settings.map)
-        self.localize_only = settings.localize_only
         self.is_extended = bool(settings.map) and not settings.localize_only  # the file is written
         self.places = PlaceMap(settings.limits.max_keyframes) if settings.map else None
         if self.is_extended:
@@ -68,8 +67,7 @@ class RunPlaces:
             self._rig.adapt(self.places, rig)
         self._known = frozenset(self.places.keyframes if self.places else ())
         # 2. What was saved, and requests for it.
-        self.requests = requests if self.is_extended else None
-        self.copy_s = settings.save_s if self.requests else 0.0  # time between two copies that are saved; 0: none is
+        self.requests = () if requests is None or not self.is_extended else (requests,)
         self.written: Path | None = None
         self._answer = answer
         self._saved = frozenset[int]()  # keyframes in the file

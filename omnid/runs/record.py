@@ -13,7 +13,6 @@ from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import Graph
 from omnid.engine.logging_setup import Report
-from omnid.engine.process import handle_stop_signals
 from omnid.engine.robot_clock import RobotClock
 from omnid.engine.threads import Poller
 from omnid.runs.wiring import RECORDED_DEPTH
@@ -56,7 +55,7 @@ def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, repo
         )
 
     poller = Poller(report_progress, PERIOD_S, "progress")
-    with closing(recorder), closing(poller), handle_stop_signals(lambda *_: graph.stop()):
+    with closing(recorder), closing(poller), graph.signals():
         graph.run()
     report_progress()
     return recorder

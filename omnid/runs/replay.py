@@ -154,8 +154,8 @@ class RunResult:
 def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> RunResult:
     """Run a log (an MCAP file or a folder of them) through the stages and return the result.
 
-    Prints nothing. A first SIGINT, SIGTERM or SIGHUP ends the run early with whole files and `signal` in the result;
-    inline, a second one raises KeyboardInterrupt. Raises OmnidError, DriverError or CalibError for wrong input and
+    Prints nothing. A first SIGINT, SIGTERM or SIGHUP ends the run early with whole files and `signal` in the result; a
+    second one ends the process at once. Raises OmnidError, DriverError or CalibError for wrong input and
     outputs that cannot be written.
     """
     options = options or ReplayOptions()
@@ -223,7 +223,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
 
         # 4. The run, and what it has counted.
         begun_s = time.monotonic()
-        with session.signals():
+        with graph.signals():
             run_to_end(graph, run_places)
         counters = _counters(session, reader, front_end, stages, wheels)
         if recorder is not None and recorder.state.messages:
@@ -254,7 +254,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             {row.stage: row for row in graph.telemetry.summary()},
             (*dict.fromkeys(warnings), *_about_input(session, reader, front_end, stages, counters)),
             newest_map[0].points if newest_map else None,
-            session.signal,
+            graph.signal,
             in_map,
             live,
             tuple(each.state for each in updates),
@@ -329,7 +329,7 @@ def _about_input(
     yield from reader.warnings
     if counters.loss:
         yield counters.loss
-    if not counters.poses and session.signal:
+    if not counters.poses and session.graph.signal:
         return
     fault, motion = front_end.odometry.last_fault, front_end.pairing.motion
     if fault.reason:

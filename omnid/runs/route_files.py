@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Final
 
@@ -59,9 +59,9 @@ class TaughtRoutes:
     """A sink of the navigation that writes a route that was taught, has its map saved, and answers the request."""
 
     def __init__(
-        self, folder: RouteFolder, to_save: Stream[SaveMap] | None, answer: Callable[[int, Answer], object]
+        self, folder: RouteFolder, to_save: Iterable[Stream[SaveMap]], answer: Callable[[int, Answer], object]
     ) -> None:
-        """to_save: takes requests to save the map; None: it is not saved. answer: takes the id of the request."""
+        """to_save: takes requests to save the map; empty: it is not saved. answer: takes the id of the request."""
         self._folder, self._to_save, self._answer = folder, to_save, answer
         self._written: TaughtRoute | None = None
 
@@ -76,6 +76,6 @@ class TaughtRoutes:
         except OmnidError as error:
             self._answer(taught.id, Answer(False, f"{error}; finish it again once that is mended"))
             return
-        if self._to_save is not None:
-            self._to_save.push(SaveMap(taught.id))
+        for requests in self._to_save:
+            requests.push(SaveMap(taught.id))
         self._answer(taught.id, Answer(True, "the route is written"))

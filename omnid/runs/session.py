@@ -1,10 +1,9 @@
-"""The parts that live runs and replays share: statistics, geometry, bus, controller, encoders, and signals."""
+"""The parts that live runs and replays share: statistics, geometry, bus, controller and encoders."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, ExitStack, suppress
-from types import FrameType
+from contextlib import ExitStack, suppress
 from typing import Final
 
 import cv2
@@ -22,7 +21,7 @@ from omnid.controller.link import ControllerLink
 from omnid.core.control.control_law import ControllerSettings
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
-from omnid.engine.process import RealtimeSettings, handle_stop_signals
+from omnid.engine.process import RealtimeSettings
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import Poller, started
@@ -96,7 +95,6 @@ class Session:
         self.config, self.graph, self.outputs, self.warn = config, graph, outputs, warn
         self.clock = clock or log_time()
         self.statistics = RunStatistics()
-        self.signal = 0  # number of the signal that ended the run
 
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
         """Return the geometry of the rig; its missing masks are looked for in frames of a log."""
@@ -151,17 +149,3 @@ class Session:
         """Return the encoder of the messages that leave the run; unix_ns: None for that of the clock."""
         scan_range_m = self.config.obstacles.scan.max_range_m
         return Encoder(rig.T_base_rig, CLOUD_POINTS, unix_ns or self.clock.unix_ns, rig, scan_range_m)
-
-    def signals(self) -> AbstractContextManager[None]:
-        """Return a context in which SIGINT, SIGTERM and SIGHUP stop the graph.
-
-        Inline, where nothing else interrupts the stage that runs in this thread, a second one raises KeyboardInterrupt.
-        """
-
-        def handle(number: int, _: FrameType | None) -> None:
-            again, self.signal = self.signal != 0, number
-            self.graph.stop()
-            if again and not self.graph.threaded:
-                raise KeyboardInterrupt
-
-        return handle_stop_signals(handle)

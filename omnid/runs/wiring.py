@@ -45,10 +45,9 @@ class Inputs:
     """What comes into a run: images, its map of places, its wheels."""
 
     frames: Sequence[Stream[Frame | MotionSample]] | Sequence[Stream[Frame]]
-    map: RunPlaces | None = None  # of places, to begin with, and its file; None: the run's own, where it is consumed
+    map: RunPlaces  # of places, to begin with, and its file
     controller: DriveLink | None = None  # that drives; None: the law in lock-step gives the commands
     navigation: Navigation | None = None
-    map_is_read: Stream[bool] | None = None  # whether the map has a reader; None: it has one
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
 
@@ -86,7 +85,6 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     geometry, run_map, navigation = front_end.geometry, inputs.map, inputs.navigation
     T_base_rig = geometry.rig.T_base_rig
     T_base_rect = T_base_rig @ geometry.T_rig_rect
-    known_places = None if run_map is None else run_map.places
     routes = RouteFolder(Path(config.navigation.routes))
     takes_all = outputs.bus is not None or outputs.recorder is not None
     mapping, places, obstacles = None, None, None
@@ -107,18 +105,16 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
 
     # 3. Poses give the map, the pose in it, and the obstacles, where these are consumed.
     if outputs.maps or takes_all:
-        mapping = Mapping(config.mapping, front_end.dense, inputs.map_every_s)
-        noted = () if inputs.map_is_read is None else (inputs.map_is_read,)
-        maps = graph.stage("mapping", mapping, poses, *noted, thread=BACKGROUND)
+        mapping = Mapping(config.mapping, front_end.dense, inputs.map_every_s, keyframes_only=graph.drops)
+        maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
     if navigation is not None:  # requests about routes pass through the thread of the files
         written = graph.stage("routes", RouteFiles(routes), navigation.requests.of_routes, thread=FILES)
-    if config.places.enabled and (outputs.places or takes_all or navigation or known_places is not None):
-        localize_only, copy_s = (False, 0.0) if run_map is None else (run_map.localize_only, run_map.copy_s)
-        places = Places(geometry, config, front_end.dense, known_places, localize_only=localize_only, copy_s=copy_s)
-        to_save = None if run_map is None else run_map.requests
-        asked: list[Stream[Any]] = [] if to_save is None else [to_save]
-        in_map = graph.stage("places", places, poses, *asked)
-        if run_map is not None and to_save is not None:
+    if config.places.enabled and (outputs.places or takes_all or navigation or run_map.places is not None):
+        save_s = config.places.save_s if run_map.requests else 0.0
+        places = Places(geometry, config, front_end.dense, run_map.places, save_s)
+        asked: list[Stream[Any]] = [poses, *run_map.requests]
+        in_map = graph.stage("places", places, *asked)
+        if run_map.requests:
             graph.sink("save", run_map, in_map, thread=FILES)
     if in_map is not None and takes_all:
         grid = MapGrid(config.mapping.voxel_m, T_base_rect, inputs.map_every_s)
@@ -130,7 +126,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     # 4. All of them, and requests, give the way to drive.
     if navigation is not None:
         requests, states, drive, answer = navigation
-        is_new = known_places is None or not known_places.keyframes
+        is_new = not run_map.places or not run_map.places.keyframes
         of_base = config.controller.collision, T_base_rig, T_base_rect
         map_name = config.places.map if places else ""
         stage = NavigationStage(config.navigation, *of_base, map_name, is_new=is_new)
@@ -172,8 +168,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         if stream is not None and outputs.bus is not None:
             graph.sink(name, outputs.bus, stream, thread=thread)
     if navigation is not None and ways is not None:
-        to_save = None if run_map is None else run_map.requests
-        graph.sink("taught", TaughtRoutes(routes, to_save, answer), ways, thread=FILES)
+        graph.sink("taught", TaughtRoutes(routes, run_map.requests, answer), ways, thread=FILES)
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
     graph.sink("keyframes", lambda _: front_end.odometry.complete(), poses, thread=poses.thread)

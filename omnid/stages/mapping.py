@@ -31,13 +31,14 @@ SAME_VIEW_NS = NS_PER_S  # Least time between two pairs of the same view that en
 class Mapping:
     """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
-    def __init__(self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0) -> None:
-        """dense: computes the depth of a pair that enters the map.
+    def __init__(
+        self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0, *, keyframes_only: bool = False
+    ) -> None:
+        """dense: computes the depth of a pair that enters the map; keyframes_only: others do not enter it.
 
         every_s: time between two maps, by the stamps; 0: one map, at the end.
         """
-        self._is_read = True  # whether the map has a reader
-        self._config, self._dense = config, dense
+        self._config, self._dense, self._keyframes_only = config, dense, keyframes_only
         self._every_ns, self._published_ns = round(every_s * NS_PER_S), 0
         self._map = VoxelMap(config.voxel_m, config.max_voxels)
         self._path = ThinnedPath(config.path_poses, config.voxel_m)
@@ -51,13 +52,10 @@ class Mapping:
         """Voxels of the map."""
         return {"voxels": len(self._map)}
 
-    def process(self, message: OdometryUpdate | bool) -> MapUpdate | None:
-        """Add the points of a pair; return the map when it is due. A bool: whether the map has a reader from now on."""
-        if isinstance(message, bool):
-            self._is_read = message
-            return None
+    def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
+        """Add the points of a pair; return the map when it is due."""
         # 1. The path has all poses, the map the points of those pairs that are due.
-        odometry = self._newest = message
+        self._newest = odometry
         self._path.add(Vertex(*odometry.T_odom_rig[:2, 3].tolist()))
         if odometry.state == TrackingState.TRACKING and self._is_due(odometry):
             self._mapped = odometry.stamp_ns, odometry.T_odom_rig
@@ -80,10 +78,9 @@ class Mapping:
         """True if a pair is to enter the map: at mapping.rate_hz, or once a second while the view is the same.
 
         Dense stereo costs as much as the odometry of a pair. A keyframe, whose dense stereo the odometry needs anyway,
-        is due after half the time, which saves that of another pair. While no client reads the map, only keyframes
-        enter it: a client that comes later finds all of the map, from fewer views.
+        is due after half the time, which saves that of another pair.
         """
-        if not (odometry.is_keyframe or self._is_read):
+        if self._keyframes_only and not odometry.is_keyframe:
             return False
         if self._mapped is None or not self._min_gap_ns:
             return True

@@ -39,17 +39,15 @@ class Places:
         config: Config,
         dense: DenseDepths,
         places: PlaceMap | None = None,
-        *,
-        localize_only: bool = False,
         copy_s: float = 0.0,
     ) -> None:
-        """dense: computes the depth of keyframes. places: a map to be extended, None: a new one. localize_only: the map
-        stays as it is. copy_s: time between two copies of the map that are to be written, by the stamps; 0: none.
+        """dense: computes the depth of keyframes. places: a map to be extended, None: a new one.
+
+        copy_s: time between two copies of the map that are to be written, by the stamps; 0: none.
         """
         self._dense = dense
-        self._localiser = MapLocaliser(
-            geometry.model(config.odometry.noise_px), config.places.limits, places, localize_only=localize_only
-        )
+        model, settings = geometry.model(config.odometry.noise_px), config.places
+        self._localiser = MapLocaliser(model, settings.limits, places, localize_only=settings.localize_only)
         self._T_rig_rect = geometry.T_rig_rect
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._limits = config.obstacles.scan

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 
 from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
-from omnid.engine.graph import Graph
+from omnid.engine.graph import Graph, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
+from omnid.runs.place_maps import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.dewarp import Dewarp
@@ -101,7 +102,7 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
             maps={"map": lambda update: write_ply(cloud, update.points)},
         )
         read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
-        wire(config, Inputs([read]), FrontEnd(place, config), graph, outputs)
+        wire(config, Inputs([read], RunPlaces(config, place, nothing)), FrontEnd(place, config), graph, outputs)
         graph.run()
     found = {label: 1e-6 * spent_ns / (pairs - SKIPPED) for label, spent_ns in clock.stage_ns.items()}
     found["all stages"] = sum(found.values())

@@ -24,11 +24,12 @@ from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.graph import Graph
+from omnid.engine.graph import Graph, nothing
 from omnid.formats.exports import write_ply
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
 from omnid.recordings.evaluation import evaluate
+from omnid.runs.place_maps import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import parse
 from omnid.sinks.files import TrajectoryFile
@@ -343,7 +344,7 @@ def test_memory_stays_constant(tmp_path: Path) -> None:
     graph = Graph(threaded=True)
     ends = Outputs(poses=poses, maps={"map": lambda update: write_ply(tmp_path / "map.ply", update.points)})
     read = graph.source("read", lambda: to_and_fro(frames, MANY_PAIRS))
-    wire(config, Inputs([read]), FrontEnd(place, config), graph, ends)
+    wire(config, Inputs([read], RunPlaces(config, place, nothing)), FrontEnd(place, config), graph, ends)
     graph.run()
     print(statistics.states, monitor.mib)
     assert statistics.poses == MANY_PAIRS

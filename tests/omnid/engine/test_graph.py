@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -13,6 +14,7 @@ from itertools import count
 import pytest
 
 from omnid.engine.graph import Graph
+from omnid.engine.process import python
 
 LONG_S = 20.0  # a timeout that only a defect reaches
 
@@ -159,14 +161,35 @@ def test_a_stop_by_a_signal_drains_and_finishes(threaded: bool) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
         return message
 
-    old = signal.signal(signal.SIGTERM, lambda *_: graph.stop())
-    try:
-        graph.sink("sink", sink, graph.stage("pass", Apply(stop_at_5), graph.source("numbers", count)))
+    graph.sink("sink", sink, graph.stage("pass", Apply(stop_at_5), graph.source("numbers", count)))
+    with graph.signals():
         graph.run()
-    finally:
-        signal.signal(signal.SIGTERM, old)
     assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all messages of the source
     assert len(sink.got) >= 6 and sink.finished == 1
+
+
+STUCK = """
+import os, signal, time
+from omnid.engine.graph import Graph
+from omnid.engine.process import python
+
+def stuck(_):
+    os.kill(os.getpid(), signal.SIGINT)
+    while not graph.signal:
+        time.sleep(0.01)
+    os.kill(os.getpid(), signal.SIGTERM)
+    while True:
+        time.sleep(0.01)
+
+graph = Graph()
+graph.sink("stuck", stuck, graph.source("numbers", lambda: range(3)))
+with graph.signals():
+    graph.run()
+"""
+
+
+def test_a_second_signal_ends_the_process_at_once() -> None:
+    assert subprocess.run(python("-c", STUCK), timeout=LONG_S).returncode == 128 + signal.SIGTERM
 
 
 def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:

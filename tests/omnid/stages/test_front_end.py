@@ -23,9 +23,10 @@ from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.column_finding import PanoramaPair
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.graph import Graph
+from omnid.engine.graph import Graph, nothing
 from omnid.formats.tum import read_tum
 from omnid.messages import FramePair, OdometryUpdate, Panoramas, SaveMap
+from omnid.runs.place_maps import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
@@ -185,7 +186,13 @@ def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: l
 
     outputs = Outputs(counters={"complete": Complete()}, bus=SlowBus())
     read = graph.source("read", lambda: frames)
-    wire(CONFIG, Inputs([read], map_every_s=0.5), FrontEnd(place, CONFIG), graph, outputs)
+    wire(
+        CONFIG,
+        Inputs([read], RunPlaces(CONFIG, place, nothing), map_every_s=0.5),
+        FrontEnd(place, CONFIG),
+        graph,
+        outputs,
+    )
     graph.run()
     assert statistics.poses == graph.telemetry.of("odometry").processed
 
@@ -207,7 +214,8 @@ def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: li
         name: graph.source(name, lambda name=name: [frame for frame in frames if frame.camera == name])  # type: ignore[misc]
         for name in CAMERAS
     }
-    wire(CONFIG, Inputs(list(cameras.values())), stages, graph, Outputs(counters={"statistics": statistics}))
+    inputs = Inputs(list(cameras.values()), RunPlaces(CONFIG, place, nothing))
+    wire(CONFIG, inputs, stages, graph, Outputs(counters={"statistics": statistics}))
     graph.run()
     of = graph.telemetry.of
     assert of("pair").dropped > 0 and of("odometry").dropped == 0

@@ -53,8 +53,6 @@ def driven(mapping: Mapping, speed_mps: float, is_keyframe: Callable[[int], bool
         T = se3.transform(np.eye(3), np.array([speed_mps * stamp_ns * 1e-9, 0, 0]))
         depth = StereoDepth(Panoramas(seq, stamp_ns, wrapped(IMAGE), wrapped(IMAGE), IMAGE > 0))
         of_pose = seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING
-        if seq == 31:
-            mapping.process(True)
         update = OdometryUpdate(*of_pose, 0, 50, 50, depth, is_keyframe=is_keyframe(seq))
         maps += mapping.process(update) is not None
     return maps
@@ -80,14 +78,11 @@ def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(
     np.testing.assert_allclose(path_xy[-1], [speed_mps * 59 / 30, 0], atol=1e-6)
 
 
-def test_keyframes_alone_enter_a_map_without_readers(place: Geometry) -> None:
-    """Later readers find it; from then on pairs enter it at its rate."""
+def test_keyframes_alone_enter_a_live_map(place: Geometry) -> None:
     dense = CountedDepths(place)
-    mapping = Mapping(MappingConfig(rate_hz=15.0), dense, 0.5)
-    mapping.process(False)
+    mapping = Mapping(MappingConfig(rate_hz=15.0), dense, 0.5, keyframes_only=True)
     maps = driven(mapping, 1.0, lambda seq: seq % 10 == 0)
-    assert dense.computed == [0, 10, 20, 30, *range(32, 60, 2)]
-    assert maps == 3, "a query for the newest one finds it"
+    assert dense.computed == [*range(0, 60, 10)] and maps == 3
 
 
 def scans(count: int) -> KeyframeScans:
