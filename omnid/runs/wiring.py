@@ -112,8 +112,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     if config.places.enabled and (outputs.places or takes_all or navigation or run_map.places is not None):
         save_s = config.places.save_s if run_map.requests else 0.0
         places = Places(geometry, config, front_end.dense, run_map.places, save_s)
-        asked: list[Stream[Any]] = [poses, *run_map.requests]
-        in_map = graph.stage("places", places, *asked)
+        in_map = graph.stage("places", places, poses, *run_map.requests)
         if run_map.requests:
             graph.sink("save", run_map, in_map, thread=FILES)
     if in_map is not None and takes_all:
