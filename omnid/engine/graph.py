@@ -9,6 +9,7 @@ Where streams of several threads merge, only the inline order is fixed.
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 from collections import deque
@@ -248,13 +249,14 @@ class Graph:
             raise self._errors[0]
 
     def signals(self) -> AbstractContextManager[None]:
-        """Return a context in which a first SIGINT, SIGTERM or SIGHUP ends the sources: what is in the inboxes is done.
+        """Return a context in which SIGINT, SIGTERM and SIGHUP end the sources: what is in the inboxes is done.
 
-        A second one ends the process at once; the controller process then stops the wheels, as after any such end.
+        Ctrl-C after one of them ends the process at once; the controller process stops the wheels, as after any end. A
+        terminal that closes may send SIGHUP twice.
         """
 
         def handle(number: int, _: FrameType | None) -> None:
-            if self.signal:
+            if self.signal and number == signal.SIGINT:
                 os._exit(128 + number)
             self.signal = number
 

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Final
 
 from drivers.frame import Camera, FrameSource
 from drivers.logs.rotating_log import RotatingLog
@@ -14,13 +13,10 @@ from omnid.config import Config
 from omnid.engine.graph import Graph
 from omnid.engine.logging_setup import Report
 from omnid.engine.robot_clock import RobotClock
-from omnid.engine.threads import Poller
 from omnid.runs.wiring import RECORDED_DEPTH
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
 from omnid.sinks.recorder import Recorder
-
-PERIOD_S: Final = 15.0  # Time between two lines about the progress.
 
 
 def open_recorder(
@@ -45,17 +41,13 @@ def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, repo
     recorder = open_recorder(config, rig, report, clock)
     graph.sink("record", recorder, *frames)
 
-    def report_progress() -> None:
-        state, dropped = recorder.state, graph.telemetry.of("record").dropped
-        written = state.messages - state.lost
-        report(
-            logging.INFO if written else logging.WARNING,
-            f"recording: {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
-            f"refused {recorder.invalid}, oldest files deleted {state.deleted}, {state.status}",
-        )
-
-    poller = Poller(report_progress, PERIOD_S, "progress")
-    with closing(recorder), closing(poller), graph.signals():
+    with closing(recorder), graph.signals():
         graph.run()
-    report_progress()
+    state, dropped = recorder.state, graph.telemetry.of("record").dropped
+    written = state.messages - state.lost
+    report(
+        logging.INFO if written else logging.WARNING,
+        f"recorded {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
+        f"refused {recorder.invalid}, oldest files deleted {state.deleted}, {state.status}",
+    )
     return recorder

@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import threading
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.engine.process import STOP_SIGNALS, handle_stop_signals, python, python_environment
+from omnid.engine.process import python, python_environment
 from omnid.engine.robot_clock import RobotClock
 from omnid.engine.threads import Poller
 from tests.set_clock import SetClock
@@ -42,17 +41,6 @@ def test_the_calls_of_a_poller_go_on_after_an_error_and_end_with_close(capsys: p
     poller.close()
     assert set(calls) == {"short work"} and capsys.readouterr().err.count("OSError: no link") == 1
     assert not threading.Event().wait(0.02) and len(calls) == 3 and "short work" not in map(str, threading.enumerate())
-
-
-@pytest.mark.usefixtures("default_signals")
-def test_each_signal_reaches_the_handler_and_the_one_before_comes_back() -> None:
-    before, came = {number: signal.getsignal(number) for number in STOP_SIGNALS}, list[int]()
-    with pytest.raises(ValueError), handle_stop_signals(lambda number, _: came.append(number)):
-        for number in STOP_SIGNALS:
-            signal.raise_signal(number)
-        raise ValueError
-    assert came == [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    assert {number: signal.getsignal(number) for number in STOP_SIGNALS} == before
 
 
 def test_modules_of_the_current_folder_are_not_imported(tmp_path: Path) -> None:
@@ -98,11 +86,6 @@ def journal(stderr: int) -> dict[str, str]:
 def test_writes_priorities_for_journald(pipe: tuple[int, int], script: str, written: bytes) -> None:
     assert exit_code(journal(pipe[1]), pipe[1], "-c", script) == 0
     assert os.read(pipe[0], 1000) == written
-
-
-def test_the_command_line_writes_its_error_with_priority(pipe: tuple[int, int]) -> None:
-    assert exit_code(journal(pipe[1]), pipe[1], "-m", "omnid", "config", "--config", "/nowhere") == 2
-    assert os.read(pipe[0], 1000).startswith(b"<3>the settings file '/nowhere' cannot be read")
 
 
 def test_a_refused_priority_is_reported_with_advice() -> None:
