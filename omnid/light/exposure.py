@@ -29,10 +29,9 @@ from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import FramePair
 
 SAMPLED_COLUMNS: Final = 160  # of the panorama: some thousand samples
-# Grey levels: the mean that is regulated to, the least mean to which bright spots may lower it, and saturation.
-TARGET, LEAST_MEAN, SATURATED = 100.0, 60.0, 250.0
+TARGET, SATURATED = 100.0, 250.0  # grey levels: the mean that is regulated to, and saturation
 # Dead band: a factor of the light below this one causes no step, so that a step down causes none up. Its square is the
-# largest step. A saturated area is assumed to be too bright by this factor.
+# largest step. A saturated area is assumed to be too bright by this factor, by which bright spots may lower the mean.
 BAND: Final = math.sqrt(2)
 STEP_S: Final = 0.5  # between two steps: images show a step only some frames later
 USUAL_HZ: Final = 30.0  # rate of cameras that keep their own
@@ -67,7 +66,7 @@ def wanted_factor(lower: GreyLevels, upper: GreyLevels) -> float:
     """Return the factor by which the light of both cameras should change, between 1 / BAND^2 and BAND^2."""
     mean, bright = max(1.0, math.sqrt(lower.mean * upper.mean)), max(1.0, lower.bright, upper.bright)
     factor = min(TARGET / mean, 1 / BAND if bright >= SATURATED else SATURATED / bright)
-    factor = max(factor, LEAST_MEAN / mean)  # lamps and windows are small: the rest shall stay visible
+    factor = max(factor, TARGET / BAND / mean)  # lamps and windows are small: the rest shall stay visible
     return min(max(factor, 1 / BAND**2), BAND**2)
 
 
