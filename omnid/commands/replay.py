@@ -7,6 +7,7 @@ import math
 import sys
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from omnid.commands.options import (
@@ -95,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     with closing(sink_of(args.rerun, args.log)) as sink:
         from omnid.viewer.rerun_sink import ReplayDrawing
 
-        drawn = replace(options, map_every_s=config.live.cloud_s, observer=lambda it, _: ReplayDrawing(sink, it))
+        drawn = replace(options, map_every_s=config.live.cloud_s, observer=partial(ReplayDrawing, sink))
         return replay_and_print(args.log, config, drawn, args)
 
 

@@ -30,7 +30,7 @@ from omnid.diagnostics.status import stage_stats, summary_stats
 from omnid.engine.graph import Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.process import RealtimeSettings
-from omnid.engine.telemetry import SummaryRow, Telemetry
+from omnid.engine.telemetry import SummaryRow
 from omnid.engine.threads import POLL_S, sleep_until
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
@@ -76,7 +76,7 @@ class ReplayOptions:
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     # Called ten times a second and at the end, with statistics, expected pairs, and whether the run has ended.
     progress: Callable[[RunStatistics, int | None, bool], object] | None = None
-    observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
+    observer: Callable[[FrontEnd], Sink[Outgoing]] | None = None  # of all messages; excludes record
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
@@ -211,8 +211,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             outputs.counters["controller"] = wheels
         if options.publish:
             bus = BusSink(session.open_bus(rig, gives_time=True), session.encoder(rig), clock=OdometryUpdate)
-        observer = options.observer(front_end, graph.telemetry) if options.observer else recorder
-        outputs = replace(outputs, bus=bus, recorder=observer)
+        outputs = replace(outputs, bus=bus, recorder=options.observer(front_end) if options.observer else recorder)
         messages = graph.source("read", _paced(reader, graph, front_end) if options.paced else reader.messages)
         inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
         stages = wire(config, inputs, front_end, graph, outputs)

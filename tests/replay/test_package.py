@@ -15,7 +15,6 @@ import pytest
 
 from drivers.logs.log_reader import LogReader
 from omnid.version import __version__
-from tests.replay.command import Command
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,10 +36,6 @@ def test_the_sample_is_small_and_whole() -> None:
     reader = LogReader(log)
     assert sum(1 for _ in reader.frames()) == 198 and not reader.warnings
     assert "rig.toml" in reader.attachments()
-
-
-def test_version(omnid: Command) -> None:
-    assert omnid("--version") == (0, f"omnid {__version__}\n", "")
 
 
 def test_version_and_help_load_nothing_heavy() -> None:
