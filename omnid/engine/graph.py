@@ -239,7 +239,7 @@ class Graph:
             for read in () if self.threaded else self._readers.values():
                 read()
             self._join(threads)
-        except BaseException as error:  # from a stage that runs inline, or no thread could be started
+        except BaseException as error:  # from the caller's signal handler, or no thread could be started
             self._errors.insert(0, error)
             self._join(threads)
         # 3. What went wrong.
