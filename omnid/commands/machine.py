@@ -73,7 +73,7 @@ def listen(args: argparse.Namespace) -> int:
     return listen_to(settings_of(args).bus, args.seconds)
 
 
-PACKAGES = ("prometheus_client", "starlette", "uvicorn")
+PACKAGES = ("starlette", "uvicorn")
 
 
 @command(ROBOT, SETTINGS)

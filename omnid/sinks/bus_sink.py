@@ -9,7 +9,7 @@ import cv2
 from calib import se3
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
-from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
+from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, UnixTime, pose_attachment, same_time
@@ -51,7 +51,7 @@ class BusSink:
         vertices = len(self._path.vertices)
         T_base_rig = self._encode.T_base_rig
         T_odom_base = T_base_rig @ odometry.T_odom_rig @ se3.inverse(T_base_rig)
-        self._path.add(Vertex(*T_odom_base[:2, -1].tolist()))
+        self._path.add(*T_odom_base[:2, -1].tolist())
         self._path_is_new |= len(self._path.vertices) != vertices
         if self._path_is_new and odometry.stamp_ns >= self._path_ns + PATH_NS:
             self._path_is_new, self._path_ns = False, odometry.stamp_ns

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeGrid
-from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
+from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.core.mapping.voxel_map import VoxelMap
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
@@ -56,7 +56,7 @@ class Mapping:
         """Add the points of a pair; return the map when it is due."""
         # 1. The path has all poses, the map the points of those pairs that are due.
         self._newest = odometry
-        self._path.add(Vertex(*odometry.T_odom_rig[:2, 3].tolist()))
+        self._path.add(*odometry.T_odom_rig[:2, 3].tolist())
         if odometry.state == TrackingState.TRACKING and self._is_due(odometry):
             self._mapped = odometry.stamp_ns, odometry.T_odom_rig
             self._frames += 1

@@ -14,7 +14,7 @@ import re
 import secrets
 import time
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from http import HTTPStatus
 from itertools import islice
@@ -26,22 +26,20 @@ from starlette.responses import PlainTextResponse, Response
 
 from calib import se3
 from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
-from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.monitor.robot_state import LEVELS, ReceivedMessage, RobotState, importance
 from omnid.plain_text import MOST_ENTRIES, plain
-from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
+from omnid.transport.session import BusConfig
 from omnid.transport.status_names import CALIBRATION, MAP_FILE, PLACES, WHEELS, Key, short_name
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
-MOST_POINTS: Final = 4000  # Most points of the path.
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
 NAVIGATION: Final = "navigation"
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
 # Topics whose newest message alone counts.
-_NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
+_NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", "path", PANORAMA)
 
 
 class RobotFeed:
@@ -51,7 +49,6 @@ class RobotFeed:
         """bus: settings of the connection, which has been checked."""
         self.bus = bus
         self.state = RobotState()
-        self.path = ThinnedPath(MOST_POINTS, 0.02)  # of the robot, in odom; a robot at rest adds none
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
         # Of the news: it grows by one each time, from a number of this start, so that pages which were open while this
@@ -65,40 +62,26 @@ class RobotFeed:
         self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
         self._wake = asyncio.Event()
 
-    def news(self, seen: int, points: int = 0, thinned: int = 0) -> dict[str, Any]:
-        """Return all that has changed since a version, and the state.
-
-        points: of the path, that the page has, after so many times that the path was thinned. Its points are [x, y] in
-        m, after a gap [x, y, 1].
-        """
-        vertices = self.path.vertices
+    def news(self, seen: int) -> dict[str, Any]:
+        """Return all that has changed since a version, and the state."""
         if not self._start <= seen <= self.version:  # of another start of this program
-            seen, points = 0, 0
-        if thinned != self.path.thinned or points > len(vertices):
-            points = 0
-        extra = {"panorama_comes": PANORAMA in self._news, "map_in_odom": self._map_in_odom}
-        found = {"seen": self.version, "state": state_news(self.bus.robot, self.state, self.link, extra)}
-        if points < len(vertices):
-            added = [[one.x_m, one.y_m, *([1] if one.after_gap else [])] for one in vertices[points:]]
-            found["path"] = {"from": points, "points": added, "thinned": self.path.thinned}
+            seen = 0
+        state = state_news(self.bus.robot, self.state, self.link)
+        state |= {"panorama_comes": PANORAMA in self._news, "map_in_odom": self._map_in_odom}
+        found = {"seen": self.version, "state": state}
         return dict(browsable(found | {k: content for k, (version, content) in self._news.items() if version > seen}))
 
     async def live(self, request: Request) -> Response:
-        """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it.
-
-        points, thinned: of its path, see `news`.
-        """
-        counts = [request.query_params.get(name, "0") for name in ("points", "thinned")]
-        counts.insert(0, request.query_params.get("seen", ""))
-        if not all(re.fullmatch(r"[0-9]{1,15}", count) for count in counts):
+        """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
+        seen = request.query_params.get("seen", "")
+        if not re.fullmatch(r"[0-9]{1,15}", seen):
             return _text("the page names the version of the news that it has seen", HTTPStatus.BAD_REQUEST)
         if request.query_params.get("panorama") == "1":
             self._wanted_until_s = time.monotonic() + 4 * QUIET_S
-        seen, points, thinned = map(int, counts)
-        if seen == self.version:
+        if int(seen) == self.version:
             async with self._changed:
                 await self._changed.wait()
-        text = json.dumps(self.news(seen, points, thinned), separators=(",", ":"), allow_nan=False)
+        text = json.dumps(self.news(int(seen)), separators=(",", ":"), allow_nan=False)
         return Response(text, media_type="application/json")
 
     async def image(self, request: Request) -> Response:
@@ -148,13 +131,8 @@ class RobotFeed:
             except Unreachable as error:
                 self.link = str(error)
                 await asyncio.sleep(QUIET_S)
-        with await asyncio.to_thread(self.robot.subscribe, PlanarPath) as paths:
-            before = paths.newest()  # which grows by the poses from here on
-        if before is not None and before.frame == PATH_FRAME:
-            for x_m, y_m in before.xy.tolist():
-                self.path.add(Vertex(x_m, y_m))
-        for topic in ("odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
-            await asyncio.to_thread(self.robot.on_message, receive, topic, kept=topic in ("status", "map"))
+        for topic in ("odom", MAP_POSE, "status", "map", "path", SCAN, NAVIGATION):
+            await asyncio.to_thread(self.robot.on_message, receive, topic, kept=topic in ("status", "map", "path"))
         self.link = ""
         self.robot.on_alive(self.state.set_alive)
         end_panorama: Callable[[], None] | None = None
@@ -177,7 +155,11 @@ class RobotFeed:
         while (received := self.state.next(0.0)) is not None:
             match received[1]:
                 case Pose() as pose:
-                    self._add_to_path(pose, before)
+                    # Another run has another odom, for which the pages load again.
+                    if before is not None and pose.attachment.run != before.attachment.run:
+                        self._map_in_odom = None
+                        self._images.clear()
+                        self._news.clear()
                     before = pose
                 case PoseInMap() as in_map:
                     self._map_in_odom = map_in_odom(in_map, self.state.recent) or self._map_in_odom
@@ -186,24 +168,16 @@ class RobotFeed:
         if self.state.forget_ended() or has_news:
             self._set("parts", parts_news(self.state))
 
-    def _add_to_path(self, pose: Pose, before: Pose | None) -> None:
-        """Add a pose; another run has another odom, for which the pages load again."""
-        if before is not None and pose.attachment.run != before.attachment.run:
-            self.path.clear()
-            self._map_in_odom = None
-            self._images.clear()
-            self._news.clear()
-        gap = before is not None and pose.attachment.resets != before.attachment.resets
-        self.path.add(Vertex(pose.x_m, pose.y_m, gap and bool(self.path.vertices)))
-
     def process_large(self, message: ReceivedMessage) -> None:
-        """Process a scan, a report of the navigation, a map or a panorama; in a thread, because that takes time."""
+        """Process a scan, a report of the navigation, a map, a path or a panorama in a thread: that takes time."""
         match self.state.process(message):
             case Scan() as scan:
                 self._set(SCAN, scan_news(scan, list(self.state.recent)))
             case NavigationReport() as report:
                 names = ("state", "reason", "task", "left_m", "teaching", "taught_m", "refusal")
                 self._set(NAVIGATION, {name: getattr(report, name) for name in names})
+            case PlanarPath(frame=frame, xy=xy) if frame == PATH_FRAME:
+                self._set("path", xy.tolist())
             case Map() as grid:
                 header, cells = map_cells(grid)
                 encoding = {"content-encoding": "deflate"}
@@ -228,11 +202,8 @@ def is_recent(stamp_ms: int) -> bool:
     return 0 <= server_ms() - stamp_ms <= 1000 * OLDEST_S
 
 
-def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the state: tracking, pose, rates, wheels, warnings.
-
-    link: why there is no connection to the robot; empty with one. extra: further entries.
-    """
+def state_news(robot: str, state: RobotState, link: str) -> dict[str, Any]:
+    """Return tracking, pose, rates, wheels, warnings. link: why there is no connection to the robot; empty with one."""
     return {
         "robot": robot,
         "link": link,
@@ -246,7 +217,6 @@ def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any
         "pace": state.real_time_factor,
         "warnings": _warnings(state, link),
         "server_ms": server_ms(),
-        **extra,
     }
 
 

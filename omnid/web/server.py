@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import json
 import logging
 import re
 import socket
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Final
+from typing import Final
 
 import uvicorn
-from prometheus_client import CONTENT_TYPE_LATEST, Metric, generate_latest
-from prometheus_client.core import CounterMetricFamily as Counter
-from prometheus_client.core import GaugeMetricFamily as Gauge
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
@@ -30,7 +27,7 @@ from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import MOST_ENTRIES, plain
-from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import BusConfig
 from omnid.transport.status_names import number, short_name
 from omnid.web.access import NO_TOKEN, Access, Guard, is_of_other_site, token_of
 from omnid.web.feed import RobotFeed
@@ -112,7 +109,7 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
         return PlainTextResponse(f"omnid web: {NO_TOKEN}\n", HTTPStatus.UNAUTHORIZED)
 
     async def numbers(_: Request) -> Response:
-        return PlainTextResponse(metrics(page.feed.state), media_type=CONTENT_TYPE_LATEST)
+        return PlainTextResponse(metrics(page.feed.state), media_type="text/plain; version=0.0.4")
 
     outer = [
         Route("/", index),
@@ -122,38 +119,25 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
     return Guard(Starlette(routes=[*outer, *page.routes()]), access)
 
 
-def metrics(state: RobotState) -> bytes:
-    """Return the metrics for Prometheus: whether the robot is there, its poses, and every number of its status."""
-    registry: Any = SimpleNamespace(collect=lambda: _of_robot(state))
-    return generate_latest(registry)
+def metrics(state: RobotState) -> str:
+    """Return the metrics for Prometheus: whether the robot is there, its poses, and every number of its status.
 
-
-def _of_robot(state: RobotState) -> Iterator[Metric]:
-    yield Gauge("omnid_up", "1 if the daemon's token is on the bus", float(state.alive is True))
-    yield Gauge("omnid_pose_rate_hz", "Poses received per second", state.rate_hz)
-    yield Counter("omnid_poses", "Poses received", state.poses)
-    yield Counter("omnid_poses_missed", "Skipped sequence numbers", state.missed)
-    parts = list(state.statuses.values())
-    levels = (((part.name,), part.level) for part in parts)
-    yield _labelled("omnid_status_level", "0 good, 1 warning, 2 error, 3 stale", ["part"], levels)
-    values = (
-        ((part.name, key), value)
-        for part in parts
-        for key, text in list(part.values.items())[:MOST_ENTRIES]
-        if (value := number(text)) is not None
-    )
-    yield _labelled("omnid_status_value", "Numbers of the status", ["part", "key"], values)
-
-
-def _labelled(name: str, text: str, labels: Sequence[str], samples: Iterable[tuple[tuple[str, ...], float]]) -> Metric:
-    """Return a metric with a sample for each set of labels; those that come again are left out."""
-    found: dict[tuple[str, ...], float] = {}
-    for given, value in samples:
-        found.setdefault(tuple(plain(short_name(label)) for label in given), value)
-    metric = Gauge(name, text, labels=labels)
-    for given, value in found.items():
-        metric.add_metric(given, value)
-    return metric
+    JSON escapes the texts of labels as the format wants it. Of two equal labels the first one counts.
+    """
+    found: dict[str, float] = {
+        "omnid_up": state.alive is True,
+        "omnid_pose_rate_hz": state.rate_hz,
+        "omnid_poses_total": state.poses,
+        "omnid_poses_missed_total": state.missed,
+    }
+    for part in list(state.statuses.values()):
+        name = f"part={json.dumps(plain(short_name(part.name)), ensure_ascii=False)}"
+        found.setdefault(f"omnid_status_level{{{name}}}", part.level)
+        for key, text in list(part.values.items())[:MOST_ENTRIES]:
+            if (value := number(text)) is not None:
+                label = json.dumps(plain(key), ensure_ascii=False)
+                found.setdefault(f"omnid_status_value{{{name},key={label}}}", value)
+    return "".join(f"{sample} {float(value)}\n" for sample, value in sorted(found.items()))
 
 
 async def _run(server: uvicorn.Server, feed: RobotFeed, listener: socket.socket) -> None:

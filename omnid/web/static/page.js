@@ -29,9 +29,7 @@ async function follow() {
     try {
       // The panorama comes while it is open and the page is seen: it takes bandwidth that the robot may need.
       const panorama = byId("panorama-box").open && !document.hidden ? 1 : 0;
-      const path = `points=${plan.points.length}&thinned=${plan.thinned}`;
-      const address = `live?seen=${seen}&${path}&panorama=${panorama}`;
-      const response = await fetch(address, { signal: AbortSignal.timeout(GONE_MS) });
+      const response = await fetch(`live?seen=${seen}&panorama=${panorama}`, { signal: AbortSignal.timeout(GONE_MS) });
       if (!response.ok) throw new Error(await response.text());
       const news = await response.json();
       await show(news);
@@ -48,7 +46,7 @@ async function follow() {
 }
 
 async function show(news) {
-  if (news.path) plan.addPath(news.path);
+  if (news.path) plan.setPath(news.path);
   if (news.scan) {
     nearest = news.scan.nearest;
     plan.setObstacles(news.scan.points);

@@ -7,6 +7,7 @@ const NEAREST_PX = 2000; // per metre
 const WIDEST_PX = 0.05;
 const OBSTACLES_MS = 2000; // for which obstacles are shown
 const OBSTACLE_PX = 2.5;
+const STEP_M = 0.02; // between poses that are added to the path
 const AIM_PX = 18; // a finger that is drawn less far gives no heading
 const SCALES_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000];
 
@@ -14,7 +15,7 @@ export class Plan {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
-    Object.assign(this, { points: [], thinned: 0, obstacles: [], pose: null, fresh: false, map: null, mapInOdom: null, fits: true });
+    Object.assign(this, { path: [], added: [], obstacles: [], pose: null, fresh: false, map: null, mapInOdom: null, fits: true });
     this.goal = null; // {x, y, yaw}: where it is to drive; yaw null: as it comes
     this.onPick = null; // takes a goal that a finger points out, while one is looked for; null: fingers move the plan
     this.onFit = () => {};
@@ -35,19 +36,17 @@ export class Plan {
     }, { passive: false });
   }
 
-  // Points [x, y] from a position of the list on; a third number marks a gap before the point. thinned: how often the
-  // server has dropped every second point.
-  addPath({ from, points, thinned }) {
-    if (from > this.points.length) return;
-    this.points.length = from;
-    this.thinned = thinned;
-    for (const point of points) this.points.push(point);
+  // The path [[x, y], ...] that the robot publishes now and then; poses are added to it until the next one.
+  setPath(points) {
+    [this.path, this.added] = [points, []];
     this.draw();
   }
 
   setPose(pose, fresh) {
     const usable = pose !== null && [pose.x_m, pose.y_m, pose.yaw_rad].every(Number.isFinite);
     this.pose = usable ? pose : null;
+    const last = this.added[this.added.length - 1];
+    if (usable && (!last || Math.hypot(pose.x_m - last[0], pose.y_m - last[1]) > STEP_M)) this.added.push([pose.x_m, pose.y_m]);
     this.fresh = fresh;
     this.draw();
   }
@@ -179,7 +178,7 @@ export class Plan {
 
   // Show all points that are known: path, obstacles, robot, and the corners of the part of the map that is known.
   fitView(width, height) {
-    const shown = [...this.points, ...this.obstacles];
+    const shown = [...this.path, ...this.added, ...this.obstacles];
     if (this.pose !== null) shown.push([this.pose.x_m, this.pose.y_m]);
     if (this.map !== null && this.map.known !== null) {
       const [x, y, yaw] = this.mapOrigin();
@@ -227,12 +226,8 @@ export class Plan {
     context.lineWidth = 2.5;
     context.lineJoin = "round";
     context.beginPath();
-    this.points.forEach((point, index) => {
-      const [x, y] = toScreen(point[0], point[1]);
-      if (index === 0 || point.length > 2) context.moveTo(x, y);
-      else context.lineTo(x, y);
-    });
-    if (this.pose !== null && this.points.length > 0) context.lineTo(...toScreen(this.pose.x_m, this.pose.y_m));
+    for (const point of [...this.path, ...this.added]) context.lineTo(...toScreen(point[0], point[1]));
+    if (this.pose !== null) context.lineTo(...toScreen(this.pose.x_m, this.pose.y_m));
     context.stroke();
   }
 

@@ -11,7 +11,6 @@ from omnid.transport.bus import Bus, BusConfig
 from tests.omnid.transport.bus_fixtures import free_endpoint
 
 pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
-pytest.importorskip("prometheus_client", reason="needs the packages of omnid[web]")
 from tests.omnid.web.servers import WebServer, served
 
 ROBOT = "rover"

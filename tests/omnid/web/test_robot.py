@@ -22,7 +22,6 @@ from prometheus_client import parser
 
 from calib import se3
 from drivers.frame import Frame
-from omnid.core.mapping.thinned_path import Vertex
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
@@ -38,7 +37,7 @@ from omnid.transport.codec import (
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
 from omnid.transport.topics import Answer, Request, command_topics
-from omnid.web.feed import MOST_POINTS, RobotFeed, scan_news, state_news
+from omnid.web.feed import RobotFeed, scan_news, state_news
 from omnid.web.server import STATIC, metrics
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 
@@ -335,33 +334,6 @@ def test_a_stop_on_a_connection_that_is_lost_is_sent_on_another_one(tmp_path: Pa
     assert len(asked) > 1 and set(asked) == {"/stop"}
 
 
-# The path.
-
-
-def test_browsers_that_come_at_any_time_show_the_same_path() -> None:
-    feed = RobotFeed(BusConfig())
-    shown: dict[int, list[list[float]]] = {1: [], 7: [], 100: []}
-    thinned = dict.fromkeys(shown, 0)
-
-    def follow(every: int) -> None:
-        """Apply the next news as the page does."""
-        news = feed.news(feed.version, len(shown[every]), thinned[every]).get("path")
-        if news is not None:
-            assert news["from"] <= len(shown[every])
-            shown[every][news["from"] :] = news["points"]
-            thinned[every] = news["thinned"]
-
-    for step in range(20_000):
-        feed.path.add(Vertex(0.01 * step, math.sin(0.01 * step), step == 500))
-        for every in shown:
-            if step % (50 * every) == 0:
-                follow(every)
-    for every in shown:
-        follow(every)
-    assert shown[1] == shown[7] == shown[100] and 1000 < len(shown[1]) <= MOST_POINTS
-    assert sum(len(point) > 2 for point in shown[1]) == 1
-
-
 # Messages.
 
 
@@ -381,7 +353,7 @@ def state(*statuses: DiagnosticStatus) -> RobotState:
 
 
 def shown(robot: RobotState, link: str = "") -> dict[str, Any]:
-    return state_news("rover", robot, link, {"more": 3})
+    return state_news("rover", robot, link)
 
 
 def test_warnings_come_with_the_worst_first_and_with_their_remedies() -> None:
@@ -444,6 +416,7 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
         "map": MAP,
         "scan": SCAN,
         "panorama": panorama(b"\xff\xd8 bytes"),
+        "path": codec.path_cdr(10**9, "odom", [(0.0, 0.0), (1.0, 0.0)]),
         "navigation": codec.diagnostics_cdr(10**18, [navigation]),
     }
     add_pose(feed, 0)
@@ -454,7 +427,7 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
         feed.process_large(ReceivedMessage(0, topic, payload, b"", 0))
     news = feed.news(0)
     assert news["state"]["map_in_odom"] is not None and news["map"]["width"] == 3 and news["panorama"]
-    assert news["scan"]["points"] and news["navigation"]["task"] == "goal" and len(news["path"]["points"]) == 2
+    assert news["scan"]["points"] and news["navigation"]["task"] == "goal" and len(news["path"]) == 2
     add_pose(feed, 5, "b")
     feed.process_inbox()
     news = feed.news(0)
@@ -466,7 +439,7 @@ def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
     state.alive = True
     values = {"rate_hz": "29.5", "mode": "640x480", "bad": "nan", 'a"} 1\nomnid_up 0': "7"}
     state.add_diagnostics(Diagnostics(1, (DiagnosticStatus("omnid: odometry", 1, "x", values),)))
-    families = parser.text_string_to_metric_families(metrics(state).decode())
+    families = parser.text_string_to_metric_families(metrics(state))
     found = {(one.name, *one.labels.values()): one.value for family in families for one in family.samples}
     assert found["omnid_up",] == 1 and found["omnid_status_level", "odometry"] == 1
     assert [value for labels, value in found.items() if labels[0] == "omnid_status_value"] == [29.5, 7.0]
