@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import logging
 import os
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
@@ -14,7 +12,7 @@ from importlib import import_module
 from itertools import dropwhile, takewhile
 from operator import methodcaller
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, cast
 
 from omnid.engine.process import handle_stop_signals
 from omnid.version import __version__
@@ -81,40 +79,14 @@ GROUPS: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 WRONG_INPUT = 2
-# What argparse says of a word that is not among the choices; Python 3.12 and later do not quote them.
-_CHOICE = re.compile(r"argument (?P<name>.*): invalid choice: '(?P<found>.*)' \(choose from (?P<all>.*)\)", re.DOTALL)
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, which proposes the word that was probably meant."""
-
-    def parse_known_args(  # type: ignore[override]  # the overloads of argparse differ only in the namespace's type
-        self, args: Sequence[str] | None = None, namespace: Any = None
-    ) -> tuple[Any, list[str]]:
-        """Parse as argparse does, but refuse unknown words here, where the help of this very command is known."""
-        found, unknown = super().parse_known_args(args, namespace)
-        if unknown:
-            options = [option for action in self._actions for option in action.option_strings]
-            self.error(f"unknown argument {unknown[0]}{_did_you_mean(unknown[0].partition('=')[0], options)}")
-        return found, unknown
+    """A parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
         """Print the error and end the program."""
-        wrong = _CHOICE.fullmatch(message)
-        if wrong:
-            choices = [choice.strip("' ") for choice in wrong["all"].split(",")]
-            among = _did_you_mean(wrong["found"], choices) or f": expected one of {', '.join(choices)}"
-            name = wrong["name"] if wrong["name"].startswith("-") else "unknown command"
-            message = f"{name} {wrong['found']!r}{among}"
-        colon = "" if message.endswith("?") else ":"
-        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}{colon} see {self.prog} --help\n")
-
-
-def _did_you_mean(word: str, known: Sequence[str]) -> str:
-    """Return the question for the nearest of the known words, or an empty text."""
-    bare = {name.lstrip("-"): name for name in known}  # that both are options is no likeness
-    nearest = difflib.get_close_matches(word[:80].lstrip("-"), bare, n=1, cutoff=0.6)
-    return f": did you mean {bare[nearest[0]]}?" if nearest else ""
+        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}: see {self.prog} --help\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
