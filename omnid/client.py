@@ -1,16 +1,16 @@
 """Client of a robot: subscribe to its messages and send it commands, from any machine.
 
-    from omnid.client import subscribe
+    from omnid.client import Pose, Robot
 
-    with subscribe("omnid") as poses:  # on another machine: connect=("tcp/robot:7447",)
-        for pose in poses:
+    with Robot("omnid") as robot:  # on another machine: connect=("tcp/robot:7447",)
+        for pose in robot.subscribe(Pose):
             print(f"{pose.state}: {pose.x_m:.3f} m, {pose.y_m:.3f} m, {pose.yaw_rad:.3f} rad")
             if pose.x_m > 2.0:
                 break
 
 Each step of the loop yields the newest pose; older ones that arrived meanwhile are dropped. The first one is the last
 pose that the robot has published, which may be old: check its stamp. A lost connection is restored without an error.
-Several kinds of message, and commands, share one connection: see Robot and Driver. Needs eclipse-zenoh, rosbags, numpy.
+Several kinds of message, and commands, share one connection. Needs eclipse-zenoh, rosbags, numpy.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2, topics
-from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Cloud, Diagnostics, Map, PlanarPath, Pose, PoseAttachment, Scan
-from omnid.transport.session import ALIVE, CONNECT_S, HERE, PERIOD_S, Unreachable, has_receiver, open_client
+from omnid.transport.session import ALIVE, CONNECT_S, HERE, PERIOD_S, BusConfig, Unreachable, has_receiver, open_client
 from omnid.transport.status_names import NavigationReport
 from omnid.transport.topics import PUBLISHED, Answer
 
@@ -45,7 +44,6 @@ __all__ = [
     "Scan",
     "Subscription",
     "Unreachable",
-    "subscribe",
 ]
 
 T = TypeVar("T")
@@ -70,14 +68,8 @@ _QUALITY: Final[dict[str, Any]] = {
 class Subscription(Generic[T]):
     """The newest message of one kind; older ones are dropped. broken: number of messages that could not be decoded."""
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        key: str,
-        decode: Callable[[bytes, bytes], T],
-        on_close: Callable[[], None] = lambda: None,
-    ) -> None:
-        self._decode, self._on_close = decode, on_close
+    def __init__(self, session: zenoh.Session, key: str, decode: Callable[[bytes, bytes], T]) -> None:
+        self._decode = decode
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
         self._latched = _queried(session, key)
         self.broken = 0
@@ -109,7 +101,6 @@ class Subscription(Generic[T]):
         """End the subscription."""
         with suppress(zenoh.ZError):
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
-        self._on_close()
 
     def __enter__(self) -> Self:
         return self
@@ -165,10 +156,10 @@ class Robot:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def subscribe(self, kind: type[T], on_close: Callable[[], None] = lambda: None) -> Subscription[T]:
+    def subscribe(self, kind: type[T]) -> Subscription[T]:
         """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map, NavigationReport or Scan."""
         topic = _TOPICS[kind]
-        return Subscription(self._session, f"{self.name}/{topic}", PUBLISHED[topic].decode, on_close)
+        return Subscription(self._session, f"{self.name}/{topic}", PUBLISHED[topic].decode)
 
     def on_message(
         self, callback: Callable[[str, bytes, bytes], None], topic: str = "*", *, kept: bool = False
@@ -218,14 +209,6 @@ class Robot:
         """True if the robot's daemon runs and can be reached."""
         replies = self._session.liveliness().get(f"{self.name}/{ALIVE}", timeout=CONNECT_S)
         return any(reply.ok is not None for reply in replies)
-
-
-def subscribe(
-    robot: str = "omnid", connect: str | Sequence[str] = (HERE,), settings: BusConfig | None = None
-) -> Subscription[Pose]:
-    """Subscribe to a robot's poses over a connection of their own; arguments as those of Robot."""
-    connection = Robot(robot, connect, settings)
-    return connection.subscribe(Pose, connection.close)
 
 
 class _RobotTime:

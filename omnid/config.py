@@ -25,7 +25,7 @@ from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.process import RealtimeSettings
 from omnid.errors import OmnidError
 from omnid.settings import changed, load
-from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import BusConfig
 
 
 @dataclass(frozen=True, slots=True)

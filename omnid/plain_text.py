@@ -1,4 +1,4 @@
-"""Texts from outside made safe to show: names of files and topics, messages of the network, errors that quote them.
+"""Stamps as text, and texts from outside made safe to show: names of files, messages, errors that quote them.
 
 A terminal, a table and a page show the same: control characters, line breaks, characters that change the direction of
 writing, and bytes of a file name that are no UTF-8 appear as escapes such as \\x1b.
@@ -6,10 +6,12 @@ writing, and bytes of a file name that are no UTF-8 appear as escapes such as \\
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import Final
 
 MOST_CHARACTERS: Final = 400
 MOST_ENTRIES: Final = 64  # of parts in a status, and of values in a part
+UNIX_TIMES_S: Final = (10**9, 2**33)  # 2001 to 2242; the clock of a simulation or of a camera is outside
 _NO_UTF8: Final = range(0xDC80, 0xDD00)  # how Python keeps a byte of a file name that is no UTF-8 (PEP 383)
 
 
@@ -29,3 +31,12 @@ def _shown(letter: str) -> str:
         return letter
     number = ord(letter)
     return f"\\x{number & 0xFF:02x}" if number in _NO_UTF8 else letter.encode("unicode_escape").decode("ascii")
+
+
+def utc(stamp_ns: int) -> str:
+    """Return date and time of a stamp (ns) to the millisecond, in ISO 8601; seconds where it is no Unix time."""
+    seconds, rest_ns = divmod(stamp_ns, 10**9)
+    rest = f"{rest_ns // 10**6:03}"
+    if not UNIX_TIMES_S[0] <= seconds < UNIX_TIMES_S[1]:
+        return f"{seconds}.{rest} s"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest}Z"

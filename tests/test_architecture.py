@@ -25,8 +25,7 @@ TIERS: Mapping[str, str] = {
     "geometry": "calib",
     "hardware and logs": "drivers",
     "settings and states": "omnid.errors omnid.version omnid.navigation_state omnid.tracking_state "
-    "omnid.settings omnid.sample "
-    "omnid.plain_text omnid.utc",
+    "omnid.settings omnid.sample omnid.plain_text",
     "numerics": "omnid.core",
     "threads, queues, the controller process": "omnid.engine omnid.controller",
     "messages, formats, bus": "omnid.messages omnid.config omnid.formats omnid.transport",

@@ -14,10 +14,9 @@ from drivers.logs.log import Log
 from drivers.logs.open_log import open_log
 from omnid.commands.options import JSON, RATE, command, failed, print_entries, print_json, warn
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.plain_text import plain
+from omnid.plain_text import plain, utc
 from omnid.recordings.evaluation import evaluate
 from omnid.recordings.truth_frame import find_truth_frame
-from omnid.utc import utc
 
 BROKEN = "cut or corrupt"
 

@@ -23,10 +23,10 @@ from omnid.formats.exports import write_grid, write_ply
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.plan import drawn_heights
 from omnid.formats.route_file import RouteFolder
+from omnid.plain_text import utc
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.files import check_outputs, write_plan
 from omnid.stages.obstacles import ADVICE
-from omnid.utc import utc
 
 MAP: Final = "map FILE.omap  a map of places"
 

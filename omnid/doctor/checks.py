@@ -25,8 +25,7 @@ from omnid.config import RecordConfig
 from omnid.controller.motor import SIMULATED, MotorSettings
 from omnid.engine.process import LOCK_ADVICE, PRIORITY_ADVICE, highest_priority, may_lock
 from omnid.errors import OmnidError
-from omnid.transport.bus_config import BusConfig
-from omnid.transport.session import zenoh_config
+from omnid.transport.session import BusConfig, zenoh_config
 
 Level = Literal["ok", "warning", "error"]
 GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups

@@ -20,9 +20,8 @@ from collections.abc import Iterator, Sequence
 import serial  # type: ignore[import-untyped]
 
 from drivers.motion import GyroSample
-from omnid.transport.bus_config import BusConfig
 from omnid.transport.sensor_codec import gyro_cdr
-from omnid.transport.session import HERE, open_client
+from omnid.transport.session import HERE, BusConfig, open_client
 
 PACKET = struct.Struct("<BB4hB")
 RADPS_PER_UNIT = math.radians(2000.0) / 32768

@@ -16,8 +16,7 @@ from omnid.client import Robot
 from omnid.engine.process import handle_stop_signals
 from omnid.monitor.robot_state import LEVELS, RobotState, importance
 from omnid.plain_text import plain
-from omnid.transport.bus_config import BusConfig
-from omnid.transport.session import Unreachable
+from omnid.transport.session import BusConfig, Unreachable
 from omnid.transport.status_names import short_name
 
 SHOW_PERIOD_S: Final = 1.0

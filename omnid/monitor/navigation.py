@@ -10,7 +10,7 @@ from typing import Final
 from omnid.client import ANSWER_S, HERE, Diagnostics, NavigationReport, Robot
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
-from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import BusConfig
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from omnid.transport.stop_datagram import STOPPED, StopSender
 

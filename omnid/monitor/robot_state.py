@@ -17,10 +17,10 @@ from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key
 from omnid.transport.topics import PUBLISHED
-from omnid.utc import OTHER_CLOCK_NS
 
 LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
+OTHER_CLOCK_NS: Final = 3_600 * 10**9  # Stamps that differ by more are of two clocks.
 _INBOX_DEPTH: Final = 2000
 _RECENT: Final = 100  # poses
 

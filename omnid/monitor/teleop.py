@@ -21,8 +21,8 @@ from omnid.client import Diagnostics, Robot
 from omnid.core.control.heading_controller import VelocityLimits
 from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError
-from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import header_cdr
+from omnid.transport.session import BusConfig
 from omnid.transport.status_names import WHEELS, Key
 from omnid.transport.topics import ARM
 

@@ -17,7 +17,7 @@ from omnid.config import Config
 from omnid.errors import OmnidError
 from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
 from omnid.formats.tum import Trajectory
-from omnid.plain_text import MOST_ENTRIES, plain
+from omnid.plain_text import MOST_ENTRIES, plain, utc
 from omnid.recordings.evaluation import associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.charts import Array, Curve, chart, colours, grid, style_and_script
@@ -26,7 +26,6 @@ from omnid.report.recorded_run import STATES, UNKNOWN, Event, RecordedRun
 from omnid.settings import changed, parse, value_at
 from omnid.transport import status_names
 from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, STAGE_PREFIX, WORK, Key, short_name, time_key
-from omnid.utc import utc
 from omnid.version import __version__
 
 LEVELS: Final = ("", "warning", "error")

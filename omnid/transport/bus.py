@@ -26,8 +26,7 @@ from zenoh import ext
 from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
-from omnid.transport.bus_config import BusConfig
-from omnid.transport.session import ALIVE, PERIOD_S, has_receiver, open_session, reason
+from omnid.transport.session import ALIVE, PERIOD_S, BusConfig, has_receiver, open_session, reason
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import (
     ARM,

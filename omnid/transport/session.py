@@ -10,15 +10,17 @@ from __future__ import annotations
 import json
 import os
 import re
+from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import zenoh
+from msgspec import Meta
 
 from omnid.errors import OmnidError
-from omnid.transport.bus_config import KEY, BusConfig
 
 HERE: Final = "tcp/127.0.0.1:7447"
+_NAME: Final = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 ALIVE: Final = "alive"  # key of the liveliness token below the robot's name
 _ROS_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
@@ -35,6 +37,32 @@ _DEFAULTS: Final = (  # what zenoh's own file may leave to default.json5
     "transport/link/tx/queue/size/real_time",
 )
 _GUARDS: Final = ("transport/link/rx/max_message_size", "low_pass_filter", "access_control")
+
+
+@dataclass(frozen=True, slots=True)
+class BusConfig:
+    """Endpoints of the bus; keys are `<robot>/...`. The default is this machine only."""
+
+    robot: Annotated[str, "first part of every key, and of the topics of --record"] = "omnid"
+    listen: Annotated[
+        tuple[str, ...],
+        "zenoh endpoints to listen on; [] with an endpoint in connect: a client, all of whose traffic goes through "
+        "that router, which is there when the robot starts",
+    ] = (HERE,)
+    connect: Annotated[tuple[str, ...], "zenoh endpoints to connect to"] = ()
+    config: Annotated[
+        str, "a zenoh configuration file (JSON5): TLS, users, who may command; omnid/transport/site.json5 is an example"
+    ] = ""
+    ros2: Annotated[Literal["off", "rmw_zenoh"], "connection to ROS 2 by its middleware rmw_zenoh"] = "off"
+    ros2_domain: Annotated[int, Meta(ge=0, le=232), "ROS_DOMAIN_ID, for rmw_zenoh"] = 0
+    panorama_hz: Annotated[
+        float, Meta(ge=0, le=60), "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none"
+    ] = 2.0
+
+    @property
+    def is_client(self) -> bool:
+        """True where all traffic goes through a router."""
+        return bool(self.connect) and not self.listen
 
 
 class Unreachable(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
@@ -85,7 +113,7 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
     zenoh's defaults are replaced because they listen on all interfaces and use multicast. Raise OmnidError for an
     invalid name or endpoint, or a file that cannot be used.
     """
-    if not (KEY if config.ros2 == "off" else _ROS_NAME).fullmatch(config.robot):
+    if not (_NAME if config.ros2 == "off" else _ROS_NAME).fullmatch(config.robot):
         raise OmnidError(
             f"bus.robot is {config.robot!r}; use letters, digits, '_', '.', '-' and inner '/'; with ROS 2 neither '.' "
             "nor '-', and a letter first"

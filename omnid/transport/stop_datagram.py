@@ -17,8 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Final
 
-from omnid.transport.bus_config import BusConfig
-from omnid.transport.session import needs_proof
+from omnid.transport.session import BusConfig, needs_proof
 
 ASKED: Final = "asked"  # the daemon has passed the stop on
 STOPPED: Final = "stopped"  # the robot is disarmed by a stop

@@ -20,7 +20,7 @@ from omnid.config import RecordConfig
 from omnid.controller.motor import MotorSettings
 from omnid.doctor import checks, wheel_wiring
 from omnid.doctor.checks import Finding, bus, cameras, disk, motor, rig
-from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import BusConfig
 from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, PtyMotor, SimulatedController
 from tests.replay.command import Command
 

@@ -31,7 +31,7 @@ from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
-from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import BusConfig
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, WHEELS, Key
 from tests.bench.faults.images import Frozen, sector
 from tests.bench.obstacles import ahead

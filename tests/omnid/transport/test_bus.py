@@ -19,7 +19,7 @@ import pytest
 import zenoh
 from zenoh import ext
 
-from omnid.client import Answer, Pose, Robot, Unreachable, subscribe
+from omnid.client import Answer, Pose, Robot, Unreachable
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
@@ -102,8 +102,8 @@ def test_late_subscribers_receive_the_newest_message_at_once() -> None:
         for i in range(3):
             bus.publish("odom", odometry(i), PoseAttachment(i, "degraded", 4).to_bytes())
         bus.serve("rig", "name = 'rig'")
-        with subscribe(connect=(endpoint,)) as poses, Robot(connect=(endpoint,)) as robot:
-            pose = poses.newest()
+        with Robot(connect=(endpoint,)) as robot:
+            pose = robot.subscribe(Pose).newest()
             assert pose is not None and pose.stamp_ns == 10**9 + 2
             assert (pose.state, pose.attachment.seq, pose.attachment.resets) == ("degraded", 2, 4)
             assert [robot.query("rig") for _ in range(50)] == ["name = 'rig'"] * 50
