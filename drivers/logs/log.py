@@ -22,7 +22,6 @@ from drivers.errors import RecordError
 from drivers.frame import Frame
 from drivers.logs.ros_messages import (
     STAMPED_TYPES,
-    JointWheels,
     header_stamp,
     parse_image,
     parse_motion,
@@ -110,9 +109,9 @@ class LoggedMessage:
         """Return the image of an image message, see `parse_image`."""
         return parse_image(self.kind, unpack_message(memoryview(self.logged)), aligned=self.aligned)
 
-    def motion(self, joints: JointWheels | None) -> MotionSample | None:
-        """Return the sample of wheels or an IMU, None of other joints."""
-        return parse_motion(self.kind, unpack_message(memoryview(self.logged)), aligned=self.aligned, joints=joints)
+    def motion(self) -> MotionSample:
+        """Return the sample of wheels or an IMU."""
+        return parse_motion(self.kind, unpack_message(memoryview(self.logged)), aligned=self.aligned)
 
 
 LogState: TypeAlias = Literal["whole", "being written", "cut or corrupt"]

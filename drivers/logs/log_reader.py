@@ -83,7 +83,7 @@ class LogReader:
     ) -> None:
         self._closed, self._span_s, self._bits, self._time = False, span_s, bits, time
         self._log = open_log(path, rate_hz)
-        self._motion, self._motion_warnings, self._joints = set[str](), list[str](), motion.joints if motion else None
+        self._motion, self._motion_warnings = set[str](), list[str]()
         try:
             name, topics = repr(str(self._log.path)), self._log.topics
             self.topics: dict[Camera, str] = choose_topics(name, topics, {"lower": lower, "upper": upper})
@@ -128,10 +128,9 @@ class LogReader:
             camera = cameras.get(message.topic)
             try:
                 if camera is None:
-                    sample = message.motion(self._joints)
-                    if sample is not None:
-                        used.update([message.topic] if stamp_ns >= first_ns else [])
-                        yield replace(sample, stamp_ns=stamp_ns)
+                    sample = message.motion()
+                    used.update([message.topic] if stamp_ns >= first_ns else [])
+                    yield replace(sample, stamp_ns=stamp_ns)
                     continue
                 image = replace(message.image(), stamp_ns=stamp_ns, camera=camera, bits=self._bits)
             except FrameDecodeError as error:
@@ -208,8 +207,7 @@ class LogReader:
                 self.warnings.append(text.format(self.counts[name], fault=self._faults.get(name, "")))
         self.warnings += warnings
         self.warnings += [
-            f"no sample of {topic} is used: by its stamps it is not of the time of the images (is it of another "
-            "clock?), or none names the wheels (motion.wheel_joints)"
+            f"no sample of {topic} is used: by its stamps it is not of the time of the images: is it of another clock?"
             for topic in sorted(unused)
             if self._log.counts()[topic]
         ]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from rosbags.typesys import Stores, get_typestore
 
@@ -19,8 +18,7 @@ COMPRESSED_IMAGE: Final = "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES: Final = (IMAGE, COMPRESSED_IMAGE)
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 IMU: Final = "sensor_msgs/msg/Imu"
-JOINT_STATE: Final = "sensor_msgs/msg/JointState"
-STAMPED_TYPES: Final = (*IMAGE_TYPES, ODOMETRY, IMU, JOINT_STATE)  # which begin with a header, whose stamp is used
+STAMPED_TYPES: Final = (*IMAGE_TYPES, ODOMETRY, IMU)  # which begin with a header, whose stamp is used
 BASE_FRAME: Final = "base_link"  # Frame of messages whose axes are those of the base (REP 105), as omnid records them.
 HEADER_BYTES: Final = 12  # of a message that begins with a header: those that tell its stamp
 NOT_MEASURED: Final = -1.0  # first number of the covariance of what an IMU does not measure (sensor_msgs/msg/Imu)
@@ -71,41 +69,14 @@ def compressed_image(stamp_ns: int, image: bytes) -> bytes:
     return head + image
 
 
-class JointWheels(NamedTuple):
-    """The joints of the driven wheels in a JointState, and the geometry of the base."""
-
-    left: str
-    right: str
-    radius_m: float
-    track_m: float
-
-    def rates(self, velocities_radps: Mapping[str, float]) -> tuple[float, ...]:
-        """Return forward velocity [m/s] and yaw rate [rad/s] from velocities by joint; empty where neither is named.
-
-        Raise FrameDecodeError where one is missing or not finite.
-        """
-        if self.left not in velocities_radps and self.right not in velocities_radps:
-            return ()  # other joints have messages of their own
-        left, right = (self.radius_m * velocities_radps.get(name, math.nan) for name in (self.left, self.right))
-        if not (math.isfinite(left) and math.isfinite(right)):
-            raise FrameDecodeError(f"a {JOINT_STATE} has no velocity of {self.left} or of {self.right}")
-        return (left + right) / 2, (right - left) / self.track_m
-
-
-def parse_motion(
-    kind: str, message: memoryview, *, aligned: bool = True, joints: JointWheels | None = None
-) -> MotionSample | None:
-    """Return the sample in a message of type ODOMETRY, IMU or JOINT_STATE, None where it is of other joints.
+def parse_motion(kind: str, message: memoryview, *, aligned: bool = True) -> MotionSample:
+    """Return the sample in a message of type ODOMETRY or IMU.
 
     Its stamp is that of the header, 0 if unset. Raise FrameDecodeError where the message is invalid. aligned: True for
-    CDR (ROS 2), False for the serialisation of ROS 1. joints: the wheels in a JOINT_STATE.
+    CDR (ROS 2), False for the serialisation of ROS 1.
     """
     found = _decoded(kind, message, aligned)
     stamp_ns = _stamp_ns(found.header.stamp.sec, found.header.stamp.nanosec)
-    if kind == JOINT_STATE:
-        velocities = dict.fromkeys(found.name, math.nan) | dict(zip(found.name, found.velocity.tolist(), strict=False))
-        rates = joints.rates(velocities) if joints is not None else ()
-        return WheelSample(stamp_ns, *rates) if rates else None
     if kind == ODOMETRY:
         velocity_mps, yaw_rate_radps = found.twist.twist.linear.x, found.twist.twist.angular.z
         if not math.isfinite(velocity_mps) or math.isinf(yaw_rate_radps):  # wheels may not report their turn

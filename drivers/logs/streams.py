@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera
 from drivers.logs.log import listed
-from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, JOINT_STATE, ODOMETRY, JointWheels
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, ODOMETRY
 
 Times: TypeAlias = NDArray[np.int64]  # (N,) [ns]
 TimeSource: TypeAlias = Literal["auto", "header", "log"]
@@ -76,20 +76,16 @@ class MotionTopics(NamedTuple):
 
     wheels: str | None = None
     imu: str | None = None
-    joints: JointWheels | None = None  # the wheels are these joints of a JointState; None: they are an Odometry
 
 
 def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopics) -> tuple[set[str], list[str]]:
     """Return the topics of wheels and IMU; where several might be meant, none, and a warning.
 
-    A topic of odometry is that of wheels if its name contains "wheel", because others are results; a topic of joints
-    may have any name. Raises DriverError for a requested topic that does not exist or is of another type.
+    A topic of odometry is that of wheels if its name contains "wheel", because others are results. Raises
+    DriverError for a requested topic that does not exist or is of another type.
     """
     chosen, warnings = set[str](), list[str]()
-    # omnid records the wheels of joints as an Odometry.
-    of_joints = wanted.joints and (wanted.wheels or JOINT_STATE in topics.values())
-    wheels = JOINT_STATE if of_joints else ODOMETRY
-    for kind, name, setting in ((wheels, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
+    for kind, name, setting in ((ODOMETRY, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
         if name and topics.get(name) != kind:
             found = f"holds {topics[name]}" if topics.get(name) else "is not"
             raise DriverError(f"topic {name!r} {found} in {log}; {setting} must be one of {kind}: {listed(topics)}")

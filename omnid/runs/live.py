@@ -41,7 +41,7 @@ from omnid.messages import SaveMap
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
-from omnid.runs.session import Session, joint_wheels, run_to_end
+from omnid.runs.session import Session, run_to_end
 from omnid.runs.systemd import Service, notify, period_s
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
@@ -58,7 +58,7 @@ from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.topics import Answer, Request
 
 NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
-NO_SAMPLES: Final = "it is not used, see motion.wheels, motion.wheel_joints and motion.imu"
+NO_SAMPLES: Final = "it is not used, see motion.wheels and motion.imu"
 NO_MAP_FILE: Final = (
     "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
     "without --localize-only"
@@ -243,16 +243,13 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
     # 4. What comes from the bus: samples of gyro and wheels, unless they come with the images of a log or of a
     #    simulation, whose motion others would not fit; a motor controller gives those of its wheels. Commands and
     #    requests; without a motor all but those to save the map are refused.
-    joints = joint_wheels(config)
     used = {
         topics.IMU: config.motion.imu != "off",
-        topics.JOINT_STATES if joints else topics.WHEEL_ODOM: config.motion.wheels != "off" and controller is None,
+        topics.WHEEL_ODOM: config.motion.wheels != "off" and controller is None,
     }
 
     def add_sample(topic: str, payload: bytes) -> None:
-        sample = sample_from_cdr(payload, topics.command_of(topic).schema, clock.stamp_ns, joints)
-        if sample is not None:
-            motion.add(sample)
+        motion.add(sample_from_cdr(payload, topics.command_of(topic).schema, clock.stamp_ns))
 
     sensors = {topic: partial(add_sample, topic) for topic in used if used[topic] and not robot.brings_samples}
     freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))

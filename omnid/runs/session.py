@@ -13,7 +13,6 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig, rig_toml
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
-from drivers.logs.ros_messages import JointWheels
 from drivers.logs.streams import MotionTopics
 from omnid.config import Config
 from omnid.controller.ipc import ControllerStart
@@ -48,21 +47,10 @@ def attached_rig(reader: LogReader, log: object) -> Rig:
 
 
 def motion_topics(config: Config) -> MotionTopics:
-    """Return the topics of a log to read. Raise OmnidError where only one of the two wheel joints is named."""
+    """Return the topics of a log to read."""
     named = {"auto": None, "off": ""}  # None: the only topic of the log, "": none
     wheels, imu = (named.get(topic, topic) for topic in (config.motion.wheels, config.motion.imu))
-    return MotionTopics(wheels, imu, joint_wheels(config))
-
-
-def joint_wheels(config: Config) -> JointWheels | None:
-    """Return the wheels as joints, None where they are an Odometry. Raise OmnidError where only one is named."""
-    joints = config.motion.wheel_joints
-    if not joints:
-        return None
-    if len(joints) != 2 or len(set(joints)) != 2:
-        raise OmnidError(f"motion.wheel_joints = {list(joints)}: expected the names of two joints, or none")
-    drive = config.motor.drive
-    return JointWheels(*joints, drive.wheel_radius_m, drive.track_m)
+    return MotionTopics(wheels, imu)
 
 
 def run_to_end(graph: Graph, run_places: RunPlaces) -> None:

@@ -38,7 +38,6 @@ Frames = tuple[str, str]
 Values: TypeAlias = tuple[object, ...]  # of the fields of a message
 ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
 IMU_SCHEMA = "sensor_msgs/msg/Imu"
-JOINT_SCHEMA = "sensor_msgs/msg/JointState"
 POSE_SCHEMA = "geometry_msgs/msg/PoseStamped"
 MAP_POSE_SCHEMA = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"

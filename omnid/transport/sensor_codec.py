@@ -1,6 +1,6 @@
 """Frames and samples of the drivers as messages of ROS 2, on topics that ROS tools and `omnid replay` recognise.
 
-Images: CompressedImage and Image. Wheels: Odometry, or JointState, which is only read. Gyro: Imu.
+Images: CompressedImage and Image. Wheels: Odometry. Gyro: Imu.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame
-from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, JointWheels, parse_motion
+from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport.codec import IMU_SCHEMA, encoded, odometry_cdr
@@ -38,20 +38,15 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> byte
     return encoded(IMU_SCHEMA, (stamp_ns, frame), *parts)
 
 
-def sample_from_cdr(
-    payload: bytes, schema: str, stamp_ns: Callable[[int], int], joints: JointWheels | None = None
-) -> MotionSample | None:
-    """Decode a sample of an Odometry, an Imu or a JointState, with a stamp; None for a JointState that has no wheel.
+def sample_from_cdr(payload: bytes, schema: str, stamp_ns: Callable[[int], int]) -> MotionSample:
+    """Decode a sample of an Odometry or an Imu with a stamp; rates that are absurd or not finite are refused.
 
-    stamp_ns: returns the stamp, as those of images, of a Unix time. joints: the wheels in a JointState.
-    Rates that are absurd or not finite are refused.
+    stamp_ns: returns the stamp, as those of images, of a Unix time.
     """
     try:
-        sample = parse_motion(schema, memoryview(payload), joints=joints)
+        sample = parse_motion(schema, memoryview(payload))
     except FrameDecodeError as error:
         raise OmnidError(str(error)) from error
-    if sample is None:
-        return None
     if not sample.stamp_ns:
         raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
     if any(abs(rate) > LARGEST_VALUE for rate in astuple(sample)[1:] if math.isfinite(rate)):

@@ -70,9 +70,8 @@ MAP: Final = "cmd/map"
 SAVE_MAP: Final = "save"  # the request on it
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
-JOINT_STATES: Final = "cmd/joint_states"
 NAVIGATION_TOPICS: Final = (GOAL, PATH, NAVIGATION, ROUTE)
-SENSOR_TOPICS: Final = (WHEEL_ODOM, IMU, JOINT_STATES)
+SENSOR_TOPICS: Final = (WHEEL_ODOM, IMU)
 TWIST: Final = "twist"
 HEADING: Final = "heading"
 
@@ -100,7 +99,6 @@ COMMANDS: Final = {
     **dict.fromkeys((NAVIGATION, ROUTE, MAP), _request(codec.STRING_SCHEMA)),
     WHEEL_ODOM: Command(codec.ODOMETRY_SCHEMA),
     IMU: Command(codec.IMU_SCHEMA),
-    JOINT_STATES: Command(codec.JOINT_SCHEMA),
 }
 # Of each source, as cmd/planner/twist. TwistStamped in base_link: linear.x m/s, angular.z rad/s; or a plain Twist,
 # whose time of sending is attached. Vector3Stamped in odom: x the speed in m/s, z the heading in rad.

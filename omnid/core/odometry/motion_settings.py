@@ -18,19 +18,13 @@ class MotionSensorSettings:
     wheels: Annotated[
         str,
         "speeds of the wheels; auto: those that the motor controller reports, of the bus (cmd/wheel_odom), or of the "
-        "only topic of a log with nav_msgs/msg/Odometry whose name contains 'wheel', with wheel_joints of JointState; "
-        "off; or that topic of the log",
+        "only topic of a log with nav_msgs/msg/Odometry whose name contains 'wheel'; off; or that topic of the log",
     ] = "auto"
     imu: Annotated[
         str,
         "gyro; auto: that of the bus (cmd/imu), or of the only topic of a log with sensor_msgs/msg/Imu; off; or that "
         "topic of the log",
     ] = "auto"
-    wheel_joints: Annotated[
-        tuple[str, ...],
-        "names of the left and the right wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, which then "
-        "stands for the Odometry of the wheels; radius and track are those of motor.drive; empty: none",
-    ] = ()
     imu_rpy_deg: Annotated[
         tuple[float, float, float],
         "orientation of the IMU on the base: roll about x, then pitch about y, then yaw about z, deg; not applied to "

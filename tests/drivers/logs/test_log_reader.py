@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
-from drivers.logs.ros_messages import IMAGE_TYPES, IMU, JOINT_STATE, ODOMETRY, JointWheels, parse_image, parse_motion
+from drivers.logs.ros_messages import IMAGE_TYPES, IMU, ODOMETRY, parse_image, parse_motion
 from drivers.logs.streams import choose_topics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from tests.drivers.logs.mcap_logs import (
@@ -192,7 +192,6 @@ def test_ambiguity_is_an_error_that_lists_the_candidates(
 # Wheels and gyros
 
 VECTOR, QUATERNION, ZEROS = TYPES["geometry_msgs/msg/Vector3"], TYPES["geometry_msgs/msg/Quaternion"], np.zeros(36)
-WHEELS = JointWheels("left", "right", 0.1, 0.4)
 
 
 def odometry(velocity_mps: float, yaw_rate_radps: float) -> bytes:
@@ -216,27 +215,18 @@ def imu(rates: tuple[float, float, float], frame: str = "imu", covariance: float
     return serialised(message, IMU)
 
 
-def joints(names: list[str], velocities: list[float]) -> bytes:
-    message = TYPES[JOINT_STATE](header(5), names, np.full(len(names), 9.0), np.array(velocities), np.zeros(0))
-    return serialised(message, JOINT_STATE)
-
-
 def serialised(message: Any, kind: str) -> bytes:
     return bytes(STORE.serialize_cdr(message, kind))
 
 
-def sample(kind: str, data: bytes) -> MotionSample | None:
-    return parse_motion(kind, memoryview(data), joints=WHEELS)
+def sample(kind: str, data: bytes) -> MotionSample:
+    return parse_motion(kind, memoryview(data))
 
 
 def test_the_rates_are_those_of_the_base() -> None:
     assert sample(ODOMETRY, odometry(0.3, -0.2)) == WheelSample(5, 0.3, -0.2)
     assert sample(IMU, imu((0.1, 0.2, 0.3))) == GyroSample(5, 0.1, 0.2, 0.3)
     assert sample(IMU, imu((0.1, 0.2, 0.3), "base_link")) == GyroSample(5, 0.1, 0.2, 0.3, of_base=True)
-    assert sample(JOINT_STATE, joints(["arm", "left", "right"], [9.0, 2.0, 4.0])) == WheelSample(
-        5, pytest.approx(0.3), 0.5
-    )
-    assert sample(JOINT_STATE, joints(["arm"], [9.0])) is None
     without_turn = sample(ODOMETRY, odometry(0.3, math.nan))
     assert isinstance(without_turn, WheelSample) and math.isnan(without_turn.yaw_rate_radps)
 
@@ -247,8 +237,6 @@ def test_the_rates_are_those_of_the_base() -> None:
         (ODOMETRY, odometry(math.nan, 0.1), "not finite"),
         (IMU, imu((0, 0, math.nan)), "not finite"),
         (IMU, imu((0.0, 0.0, 0.0), covariance=-1.0), "covariance begins with -1"),
-        (JOINT_STATE, joints(["left"], [1.0]), "no velocity of left or of right"),
-        (JOINT_STATE, joints(["left", "right"], [1.0, math.inf]), "no velocity of left or of right"),
         (ODOMETRY, imu((0.0, 0.0, 0.0)), "truncated or invalid"),
     ],
 )
@@ -262,7 +250,6 @@ WHOLE = {
     IMAGE: image_message(10**18, "mono8", np.zeros((4, 5), np.uint8)),
     ODOMETRY: odometry(1.0, 1.0),
     IMU: imu((1.0, 1.0, 1.0)),
-    JOINT_STATE: joints(["left", "right"], [1.0, 2.0]),
 }
 
 
