@@ -128,11 +128,6 @@ class OdometryUpdate:
         """Position (3,) of the rig in odom, m: the last column of T_odom_rig."""
         return self.T_odom_rig[:3, 3]
 
-    @property
-    def T(self) -> Array:
-        """Pose (4, 4) of the rig in odom: T_odom_rig, by the name that many guess."""
-        return self.T_odom_rig
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapKeyframes:

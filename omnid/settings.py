@@ -73,17 +73,14 @@ def value_at(settings: object, path: str) -> object:
     return reduce(getattr, path.split("."), settings)
 
 
-def dump(settings: object) -> str:
-    """Return commented TOML with the description, range and default of every key; `load` reads the same object."""
-    return "\n".join(_lines(settings, type(settings)(), (), None)).strip("\n") + "\n"
+def dump(settings: object, wanted: Collection[str] | None = None) -> str:
+    """Return commented TOML with the description, range and default of every key; `load` reads the same object.
 
-
-def dump_minimal(settings: object, wanted: Collection[str]) -> str:
-    """Return TOML with the keys that differ from their defaults; all others keep those of the installed version.
-
-    wanted: dotted paths of keys that are listed in any case, commented out where they have their default.
+    wanted: dotted paths of keys. With them, only these and the keys that differ from their defaults are listed, without
+    ranges; a key with its default is commented out, so that it keeps that of the installed version.
     """
-    return "\n".join(_lines(settings, type(settings)(), (), {*wanted, *changed(settings)})).strip("\n") + "\n"
+    chosen = None if wanted is None else {*wanted, *changed(settings)}
+    return "\n".join(_lines(settings, type(settings)(), (), chosen)).strip("\n") + "\n"
 
 
 def _change(root: type, text: str) -> tuple[Path, object]:

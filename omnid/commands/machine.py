@@ -31,7 +31,7 @@ from omnid.errors import OmnidError
 from omnid.light.exposure import USUAL_HZ
 from omnid.monitor.listen import listen as listen_to
 from omnid.service import install
-from omnid.settings import dump, dump_minimal
+from omnid.settings import dump
 from omnid.transport.session import zenoh_config
 
 
@@ -53,7 +53,7 @@ def print_config(args: argparse.Namespace) -> int:
     args.config = args.file or args.config
     config = settings_of(args)
     if args.action == "print":
-        print(dump_minimal(config, FIRST_SETTINGS) if args.minimal else dump(config), end="")
+        print(dump(config, FIRST_SETTINGS if args.minimal else None), end="")
         return 0
     # Words that only the daemon's start would refuse.
     zenoh_config(config.bus)

@@ -11,7 +11,7 @@ from omnid.config import FIRST_SETTINGS, Config
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_whole
 from omnid.plain_text import plain
-from omnid.settings import dump_minimal
+from omnid.settings import dump
 
 SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # The path of omnid in the shipped units.
 # Folders that the units do not see: ProtectHome=, PrivateTmp=.
@@ -46,7 +46,7 @@ def files_to_write(program: Path, *, page: bool = False, root: Path = Path("/"))
     wanted = {root / name: text for name, text in texts.items()}
     found = {path: text for path, text in wanted.items() if not path.exists() or path.read_text() != text}
     kept = {"udev/rules.d/90-omnid.rules": service_file("90-omnid.rules")}
-    kept["omnid/omnid.toml"] = dump_minimal(Config(), FIRST_SETTINGS)
+    kept["omnid/omnid.toml"] = dump(Config(), FIRST_SETTINGS)
     return found | {root / "etc" / name: text for name, text in kept.items() if not (root / "etc" / name).exists()}
 
 

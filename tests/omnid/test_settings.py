@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from omnid.config import FIRST_SETTINGS, Config, load_config, unused_settings
 from omnid.errors import OmnidError
-from omnid.settings import dump, dump_minimal, load, parse, paths_of
+from omnid.settings import dump, load, parse, paths_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
 )
 def test_a_dump_reads_back_as_the_same_object(tmp_path: Path, overrides: list[str]) -> None:
     settings = load(Sample, None, overrides)
-    for text in (dump(settings), dump_minimal(settings, ("robot", "stereo.subpixel"))):
+    for text in (dump(settings), dump(settings, ("robot", "stereo.subpixel"))):
         assert load(Sample, written(tmp_path, text)) == settings
 
 
@@ -135,8 +135,8 @@ def test_a_dump_has_each_key_with_its_range_and_default_and_a_minimal_one_what_d
     assert "# a list of 3 numbers; default [0.0, 1e-05, 1e+16]\n" in text
     assert "# one of 'sad', 'census'; default \"sad\"\n" in text
     assert "# a list of integers of at least 1; default [115200, 9600]\n" in text
-    assert dump_minimal(settings, ()) == "[stereo]\n# side of the matching window, px\nwindow_px = 5\n"
-    assert "# whether to refine\n# subpixel = true\n" in dump_minimal(settings, ("stereo.subpixel",))
+    assert dump(settings, ()) == "[stereo]\n# side of the matching window, px\nwindow_px = 5\n"
+    assert "# whether to refine\n# subpixel = true\n" in dump(settings, ("stereo.subpixel",))
 
 
 SHIPPED = Path(__file__).parents[2] / "systemd" / "omnid.toml"
@@ -144,7 +144,7 @@ SHIPPED = Path(__file__).parents[2] / "systemd" / "omnid.toml"
 
 def test_the_shipped_configuration_is_the_default() -> None:
     assert load_config(SHIPPED) == Config()
-    assert SHIPPED.read_text() == dump_minimal(Config(), FIRST_SETTINGS), "run `omnid config --minimal`"
+    assert SHIPPED.read_text() == dump(Config(), FIRST_SETTINGS), "run `omnid config --minimal`"
     assert set(FIRST_SETTINGS) <= set(paths_of(Config))
 
 
