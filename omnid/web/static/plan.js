@@ -8,6 +8,7 @@ const WIDEST_PX = 0.05;
 const OBSTACLES_MS = 2000; // for which obstacles are shown
 const OBSTACLE_PX = 2.5;
 const STEP_M = 0.02; // between poses that are added to the path
+const MOST_ADDED = 500; // of these, where the robot publishes no path for a long time
 const AIM_PX = 18; // a finger that is drawn less far gives no heading
 const SCALES_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000];
 
@@ -46,7 +47,9 @@ export class Plan {
     const usable = pose !== null && [pose.x_m, pose.y_m, pose.yaw_rad].every(Number.isFinite);
     this.pose = usable ? pose : null;
     const last = this.added[this.added.length - 1];
-    if (usable && (!last || Math.hypot(pose.x_m - last[0], pose.y_m - last[1]) > STEP_M)) this.added.push([pose.x_m, pose.y_m]);
+    if (usable && (!last || Math.hypot(pose.x_m - last[0], pose.y_m - last[1]) > STEP_M)) {
+      this.added = [...this.added.slice(-MOST_ADDED), [pose.x_m, pose.y_m]];
+    }
     this.fresh = fresh;
     this.draw();
   }
