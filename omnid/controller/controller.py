@@ -12,7 +12,7 @@ from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.ipc import ControllerState, TickReport, cuts_drive_short, transitions
-from omnid.core.control.contacts import BUS, MOTOR, ContactState
+from omnid.core.control.arming import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerSettings
 from omnid.core.control.heading_controller import STOP, Twist
 from omnid.core.control.motion_monitor import Motion

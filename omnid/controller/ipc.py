@@ -19,9 +19,8 @@ from typing import Any, Final, NamedTuple
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.controller.motor import MotorSettings
-from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
+from omnid.core.control.arming import NO_ANSWER, NO_CONTACT, STARTED, ArmAnswer, ContactState
 from omnid.core.control.collision_monitor import remedy
-from omnid.core.control.contacts import NO_CONTACT, ContactState
 from omnid.core.control.control_law import ControlInput, ControllerSettings
 from omnid.core.control.motion_monitor import ADVICE, CONFLICTS, DISAGREEMENTS, MOTION_DOUBTFUL, Conflict
 from omnid.core.control.safety_rules import ENDS, IDLE

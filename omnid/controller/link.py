@@ -24,7 +24,7 @@ from omnid.controller.ipc import (
     TickReport,
     socket_pair,
 )
-from omnid.core.control.contacts import NO_CONTACT
+from omnid.core.control.arming import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.graph import Stream

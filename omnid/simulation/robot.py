@@ -31,10 +31,9 @@ from drivers.motors.simulated_motor import MotionLimits, Pose, SimulatedMotor
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.ipc import TickReport
-from omnid.core.control.arming import ArmRequest
+from omnid.core.control.arming import ArmRequest, ContactState
 from omnid.core.control.collision_monitor import ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint
-from omnid.core.control.contacts import ContactState
 from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor

@@ -13,7 +13,6 @@ from typing import Annotated, Final
 
 from msgspec import Meta
 
-from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.motion_monitor import (
     BATTERY_EMPTY,
     CONFLICTS,
@@ -44,6 +43,9 @@ ASKED: Final = "a stop was asked for"
 AWAITED: Final = "waiting for the motor"
 FAILED: Final = "the motor controller failed"
 STOPPED: Final = "the motor controller had stopped by itself"
+CLIFF: Final = "a cliff sensor sees no floor"
+BUMPER: Final = "the bumper is pressed"
+LATCHING: Final = frozenset({BUMPER, CLIFF})  # as a stop that was asked for: only a request to arm releases them
 OVERLOADED: Final = "the host is overloaded"
 NO_POSE: Final = "there is no pose yet"
 POSE_STALE: Final = "the pose is stale"

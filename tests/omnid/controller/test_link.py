@@ -31,10 +31,9 @@ from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
 from omnid.core.control.collision_monitor import BLOCKED, SCAN_STALE, CollisionSettings, ControllerScan, remedy
 from omnid.core.control.command_sources import TimedSetpoint
-from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
-from omnid.core.control.safety_rules import Deadlines
+from omnid.core.control.safety_rules import BUMPER, CLIFF, Deadlines
 from omnid.engine.process import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError

@@ -17,7 +17,7 @@ from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.controller import Controller
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
+from omnid.core.control.arming import AUTOMATIC, MANUAL, NO_CONTACT, ArmRequest
 from omnid.core.control.collision_monitor import (
     BLOCKED,
     MOVING,
@@ -29,7 +29,6 @@ from omnid.core.control.collision_monitor import (
     MovingPoint,
 )
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
-from omnid.core.control.contacts import BUMPER, CLIFF, NO_CONTACT
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
@@ -39,6 +38,7 @@ from omnid.core.control.heading_controller import (
     wrap_angle,
 )
 from omnid.core.control.motion_monitor import AGREE, CONFLICTS, Conflict
+from omnid.core.control.safety_rules import BUMPER, CLIFF
 from tests.omnid.controller.bench import LIMITS, PERIOD_NS, PERIOD_S, SETTINGS
 
 TICKS = 6_000

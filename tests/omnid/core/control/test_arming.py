@@ -11,8 +11,7 @@ import pytest
 
 from drivers.motor import is_stop
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL, OLDER_THAN_STOP, STARTED, TOO_LATE, ArmRequest
-from omnid.core.control.contacts import BUMPER, CLIFF, LATCHING, NO_CONTACT
+from omnid.core.control.arming import AUTOMATIC, MANUAL, NO_CONTACT, OLDER_THAN_STOP, STARTED, TOO_LATE, ArmRequest
 from omnid.core.control.motion_monitor import (
     ADVICE,
     COMPARED,
@@ -24,6 +23,7 @@ from omnid.core.control.motion_monitor import (
     Conflict,
     MotionSettings,
 )
+from omnid.core.control.safety_rules import BUMPER, CLIFF, LATCHING
 from tests.omnid.controller.bench import LIMITS, SETTINGS, UNATTENDED, Bench
 
 
