@@ -66,7 +66,7 @@ class Robot:
         self.stage.process(WheelState(True, False))
         self.files = RouteFiles(RouteFolder(folder))
         self.written: dict[int, Answer] = {}  # answers to requests to write a route
-        self.writer = TaughtRoutes(RouteFolder(folder), None, self.written.__setitem__)
+        self.writer = TaughtRoutes(RouteFolder(folder), (), self.written.__setitem__)
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
         self.seq = 0
         self.updates: list[NavigationUpdate] = []

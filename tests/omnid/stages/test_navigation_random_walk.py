@@ -62,7 +62,7 @@ class Walk:
         self.law = ControlLaw(SETTINGS, -1)
         self.stage = fixed_map(NAVIGATION, SETTINGS.collision, np.eye(4), is_new=True)
         self.files, self.written = RouteFiles(RouteFolder(folder)), dict[int, Answer]()
-        self.writer = TaughtRoutes(RouteFolder(folder), None, self.written.__setitem__)
+        self.writer = TaughtRoutes(RouteFolder(folder), (), self.written.__setitem__)
         self.pose, self.motion = np.zeros(3), (0.0, 0.0)
         self.seq = self.resets = 0
         self.state, self.map_state, self.kind = TrackingState.TRACKING, MapState.LOCALIZED, "free"
