@@ -17,7 +17,7 @@ from typing import Final
 import serial  # type: ignore[import-untyped]
 
 from drivers.backoff import Backoff
-from drivers.errors import DriverError
+from drivers.errors import DriverError, one_line
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
@@ -243,7 +243,7 @@ class SerialMotor:
             raise DriverError(f"motor on {self._name}: {error}") from None
         except (OSError, termios.error) as error:
             self._release()
-            raise DriverError(f"motor on {self._name} is gone ({_one_line(error)}); plug it in again") from None
+            raise DriverError(f"motor on {self._name} is gone ({one_line(error)}); plug it in again") from None
 
     def _write(self, data: bytes) -> None:
         """Write all data at once; raise NoReplyError if the output buffer is full, as the other end does not read."""
@@ -287,14 +287,10 @@ def _opened(port: str, baud: int) -> serial.Serial:
         reason = _REASONS.get(getattr(error, "errno", None) or 0)
         raise DriverError(
             f"motor port {port!r} at {baud} baud cannot be opened: "
-            f"{reason or _one_line(error) + '; is it a serial port?'}"
+            f"{reason or one_line(error) + '; is it a serial port?'}"
         ) from None
 
 
 def _clock_s() -> float:
     """Return the time with that in which the host was suspended: a controller's watchdog expires meanwhile."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
