@@ -92,13 +92,13 @@ def pixels_in_upper(
     return pixels
 
 
-def nearby_disparity(disparity: NDArray[np.float32], points: Array, reach_px: int = REACH_PX) -> Array:
-    """Return the median disparity (N,) of the located pixels within reach_px of points (N, 2); NaN where there is none.
+def nearby_disparity(disparity: NDArray[np.float32], points: Array) -> Array:
+    """Return the median disparity (N,) of the located pixels within REACH_PX of points (N, 2); NaN where there is none.
 
     A feature counts as located if a located point lies close to it: Dang et al. 2012, eq. (8).
     """
     height, width = disparity.shape
-    offsets = np.arange(-reach_px, reach_px + 1)
+    offsets = np.arange(-REACH_PX, REACH_PX + 1)
     columns = (np.rint(points[:, 0]).astype(int)[:, None, None] + offsets[None, None, :]) % width
     rows = np.clip(np.rint(points[:, 1]).astype(int)[:, None, None] + offsets[None, :, None], 0, height - 1)
     around = disparity[rows, columns].reshape(len(points), len(offsets) ** 2)

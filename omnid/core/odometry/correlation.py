@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.odometry.corners import REACH_PX
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -34,7 +35,6 @@ SIDE_PX = KltSettings().window_px  # side of a patch
 # By how much the correlation of the patch at its own disparity exceeds that at another one where it does not repeat,
 # because identical bricks differ by less than 0.05, other textures by 0.3 and more.
 LEAST_LEAD = 0.15
-APART_PX = 3.0  # least distance of two disparities, more than the width of a peak
 
 
 def normalised_patches(
@@ -93,6 +93,6 @@ def repeats(pair: Pair, pixels: Array, rows: Array, most_px: int) -> Flags:
         upper, _ = normalised_patches(pair[1], there, SIDE_PX)
         scores[:, disparity] = np.where(there[:, 1] < len(pair[1].image), (lower * upper).sum(axis=1), -1.0)
     # 2. The best one near the own disparity, and the best one elsewhere.
-    is_own = np.abs(np.arange(most_px + 1) - own[:, None]) <= APART_PX
+    is_own = np.abs(np.arange(most_px + 1) - own[:, None]) <= REACH_PX
     at_own = np.where(is_own, scores, -1.0).max(axis=1)
     return np.asarray(np.where(is_own, -1.0, scores).max(axis=1) > at_own - LEAST_LEAD)

@@ -28,8 +28,8 @@ from calib import se3
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.motion_hypotheses import DECIDING_COST
-from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS
+from omnid.core.odometry.motion_hypotheses import DECIDING_COST, LANDMARKS
+from omnid.core.odometry.pose_estimation import CORRELATED, DAMPING, GAUSS_NEWTON_STEPS
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama
@@ -39,23 +39,19 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-MOST: Final = 160  # landmarks that are followed in each camera
 SIGMA_PX: Final = 0.2  # of a flow
 OUTLIER_SQUARED: Final = 32.0  # squared distance, a sum of two squares, from which on a flow costs no more
 MOST_SQUARED: Final = 25 * OUTLIER_SQUARED  # of noise of half a pixel; where it is larger, flows are displaced
-GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera, or up to a line
-# Least share of the flows on either side of a tear, and of what right images leave of them that it explains.
-LEAST_PART: Final = 0.2
+# Share of the flows that no break displaces, of one camera or up to a line; least share of them on either side of a
+# tear, and of what right images leave of them that it explains.
+LEAST_SHARE: Final = 0.2
 # Cost of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected: the mean of the Cauchy kernel's.
 RIGHT_COST: Final = 0.31
-FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
-FAR: Final = KltSettings(levels=2)  # 28 px
-RIDGE: Final = 1e-6
 LINES: Final = 12  # equal parts of the raw image, at whose borders lines are tried
 LEAST: Final = 8  # flows on either side of a line in the cameras of a break
 LEAST_PX: Final = 0.5  # least displacement of a part of an image against the rest: less harms no pose
-MEMORY_S: Final = 1.0  # time constant with which evidence of tears decays: vehicles change their motion more often
-ROUNDS: Final = 5
+# Time constant with which evidence of tears decays, as vehicles change their motion more often, and of the usual cost.
+MEMORY_S: Final = 1.0
 CAMERAS: Final = ("lower", "upper")
 SETS: Final = ((0,), (1,), (0, 1))  # cameras whose images are broken in one way
 
@@ -180,7 +176,7 @@ class ImageBreaks:
             flow = self._flow(last, now, local_map)
             found = None if flow is None else likeliest_break(flow, self._raws, self._model.cylinder.focal_px)
         if cost is not None and found is None:
-            usual = self._usual_cost + FOLLOWED * (cost[0] - self._usual_cost)
+            usual = cost[0] + math.exp(-dt_s / MEMORY_S) * (self._usual_cost - cost[0])
             self._usual_cost = min(usual, RIGHT_COST)  # a run whose images are broken from the start is not usual
         # 2. What is broken now.
         self._torn *= math.exp(-dt_s / MEMORY_S)
@@ -211,7 +207,7 @@ class ImageBreaks:
         """Return the flows of the landmarks that the map shows in the last pair, None: too few of them are found."""
         cylinder, baseline_m = self._model.cylinder, self._model.baseline_m
         landmarks, _ = local_map.visible(last.T_odom_rect)
-        landmarks = landmarks[:: max(1, -(-len(landmarks) // MOST))]
+        landmarks = landmarks[:: max(1, -(-len(landmarks) // LANDMARKS))]
         covariance = local_map.table.covariance[landmarks]
         before, after = (
             se3.apply(se3.inverse(each.T_odom_rect), local_map.table.points[landmarks]) for each in (last, now)
@@ -231,8 +227,8 @@ class ImageBreaks:
             raw, by_raw = raw_image.at(end)
             rows = np.flatnonzero(np.isfinite(raw).all(axis=1) & cylinder.shows(start[:, 0]))
             sought += len(rows)
-            there, found = track(last.pair[camera], now.pair[camera], start[rows], end[rows], FAR)
-            again, found_again = track(last.pair[camera], now.pair[camera], start[rows], start[rows], FAR)
+            there, found = track(last.pair[camera], now.pair[camera], start[rows], end[rows], KltSettings())
+            again, found_again = track(last.pair[camera], now.pair[camera], start[rows], start[rows], KltSettings())
             there[~found], found = again[~found], found | found_again
             rows, d = rows[found], there[found] - end[rows[found]]
             d[:, 0] = cylinder.wrap(d[:, 0])
@@ -260,9 +256,9 @@ def likeliest_break(flow: Flow, raws: tuple[RawImage, RawImage], focal_px: float
     whole, off = squares[best], lefts[best]
     # The noise of flows is at least that expected: so many sums of two squares of unit variance are smaller.
     scale = np.clip(
-        np.quantile(whole, GOOD_SHARE) / (-2 * math.log(1 - GOOD_SHARE)), 1.0, MOST_SQUARED / OUTLIER_SQUARED
+        np.quantile(whole, LEAST_SHARE) / (-2 * math.log(1 - LEAST_SHARE)), 1.0, MOST_SQUARED / OUTLIER_SQUARED
     )
-    outlier, unit = OUTLIER_SQUARED * scale, 2 * scale * CORRELATED_LANDMARKS
+    outlier, unit = OUTLIER_SQUARED * scale, 2 * scale * CORRELATED
     all_gain = float(np.minimum(whole, outlier).sum()) / unit
     if all_gain < DECIDING_COST + _cost(3, count):
         return None  # no break explains more than all that is left
@@ -278,7 +274,7 @@ def likeliest_break(flow: Flow, raws: tuple[RawImage, RawImage], focal_px: float
             columns = (
                 steps if is_torn else np.concatenate([flow.by_raw * each[:, None, None] for each in masks], axis=2)
             )
-            least = LEAST_PART * own.sum() if is_torn else LEAST
+            least = LEAST_SHARE * own.sum() if is_torn else LEAST
             for line, is_before in ((n / LINES, side) for n in range(LINES) for side in (False, True)):
                 beyond = own & ((flow.row >= line) != is_before)
                 is_whole = line == 0 and not is_before and not is_torn and cameras != (1 - most_off,)
@@ -289,7 +285,7 @@ def likeliest_break(flow: Flow, raws: tuple[RawImage, RawImage], focal_px: float
                 left = ((y - A @ solution) ** 2).sum(axis=1)
                 gain = float((np.minimum(whole, outlier) - np.minimum(left, outlier)).sum()) / unit
                 gain -= _cost(columns.shape[2], count)
-                if gain < max(DECIDING_COST, LEAST_PART * all_gain * is_torn, 0.0 if found is None else found.gain):
+                if gain < max(DECIDING_COST, LEAST_SHARE * all_gain * is_torn, 0.0 if found is None else found.gain):
                     continue
                 amount = solution[6:]
                 moved_px = np.linalg.norm(A[beyond][:, :, 6:] @ amount, axis=1) * flow.px[beyond]
@@ -320,9 +316,9 @@ def _weight(left: Array) -> Array:
 def _robust(A: Array, y: Array, weight: Array) -> Array:
     """Return x (K,) that minimises the Geman-McClure cost of y - A x, A (N, 2, K), from weights (N,)."""
     x, size = np.zeros(A.shape[2], float), A.shape[2]
-    for _ in range(ROUNDS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         weighted = (weight[:, None, None] * A).reshape(-1, size)
-        normal = weighted.T @ A.reshape(-1, size) + RIDGE * np.eye(size)
+        normal = weighted.T @ A.reshape(-1, size) + DAMPING * np.eye(size)
         x = np.linalg.solve(normal, weighted.T @ y.ravel()).astype(float)
         weight = _weight(y - A @ x)
     return x

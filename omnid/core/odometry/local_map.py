@@ -21,6 +21,7 @@ from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, RigVelocity
 from omnid.core.odometry.plane_patches import REACH_PX, AlignedPatches, align, moved_slopes, plane_templates
+from omnid.core.odometry.pose_estimation import CORRELATED
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import MIN_RADIUS2_M2, point_covariance, triangulate, view
 from omnid.core.types.panorama import PaddedPanorama
@@ -30,7 +31,6 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
 OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used, so that 0.3 % of right ones are
 COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level, few because the patches are aligned afterwards.
 # Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked.
@@ -208,7 +208,7 @@ class LocalMap:
         H = np.einsum("ni,nij->nj", -(predicted / r2)[:, None] * seen[:, :2], T_curr_anchor[:, :2, :3])
         # 2. The update, without outliers.
         PH = np.einsum("nij,nj->ni", P, H)
-        S = (H * PH).sum(axis=1) + CORRELATED_FRAMES * (variance + 2 * self._model.sigma_px**2)
+        S = (H * PH).sum(axis=1) + CORRELATED * (variance + 2 * self._model.sigma_px**2)
         innovation = disparity - predicted
         right = innovation**2 < OUTLIER_SQUARED * S
         rows, gain = rows[right], (PH / S[:, None])[right]

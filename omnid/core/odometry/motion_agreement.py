@@ -37,6 +37,7 @@ from omnid.core.control.motion_monitor import (
     IMAGES_DIFFER,
     IMAGES_OR_GYRO,
     IMAGES_OR_WHEELS,
+    MAX_MOTIONS,
     WHEELS_DIFFER,
     Conflict,
     Difference,
@@ -48,12 +49,9 @@ Array = NDArray[np.float64]
 # Window of the sums, and allowed differences: 0.3 s are 0.15 m at 0.5 m/s, the distance that the collision monitor
 # keeps; 10 % of 3 m are twice that.
 WINDOW_S, WINDOW_M, SCALE_SHARE, ALLOWED_LAG_S = 10.0, 3.0, 0.1, 0.3
-# Lags that are compared: drivers of cameras buffer some images, up to a second or so.
+# Lags that are compared, and least time between two comparisons: drivers of cameras buffer images for a second or so.
 LAG_STEP_S: Final = 0.05
 LAGS_S: Final = np.arange(-0.5, 1.5 + LAG_STEP_S / 2, LAG_STEP_S)
-# Sigma of an allowed lag: of two sensors one may show a motion so much before the other, because motors follow commands
-# late and exposures last.
-LAG_SIGMA_S: Final = 0.1
 DOUBT_SHARE: Final = 0.5  # Share of a limit from which on the base drives slowly; by trial on development seeds.
 # Limits for a doubt in the newest second alone, 0.1 m and a third of the way: images that play at half of the speed
 # show half of it.
@@ -70,9 +68,7 @@ WORSE: Final = 3.0  # ratio of the sums of squares that the lag must explain, be
 LATE_S: Final = 0.5  # A lag is a fault after this time, because the newest steps are the noisiest.
 SCALES: Final = (0.3, 3.0)  # Scales of the motion in the search of a lag, because images may be slow as well as late.
 STILL_S, STILL_M, STILL_RAD = 2.0, 0.02, 0.04  # Limits of rest, because 1 cm/s and a degree a second are noise.
-MOST_KEPT: Final = 2048  # steps, so that memory is bounded: WINDOW_S at 200 Hz
 LEAST_STEPS: Final = 8  # Steps that are needed for a comparison, because fewer show no delay.
-EVERY_S: Final = 0.1  # Time between two comparisons, because each takes a millisecond.
 
 
 class _Finding(NamedTuple):
@@ -96,7 +92,7 @@ class MotionAgreement:
     def __init__(self, motion: MotionFilter) -> None:
         """motion: the filter, with the samples of wheels and gyro."""
         # Starts and ends [s] of steps of the base, distance ahead [m], turn [rad], distance aside [m] by the cameras.
-        self._steps: deque[tuple[float, float, float, float, float]] = deque(maxlen=MOST_KEPT)
+        self._steps: deque[tuple[float, float, float, float, float]] = deque(maxlen=MAX_MOTIONS)
         self._motion = motion
         self._compared_s = -math.inf
         self._late_since_s: float | None = None
@@ -111,7 +107,7 @@ class MotionAgreement:
         end_s = seconds(end_ns)
         self._steps.append((seconds(start_ns), end_s, distance_m, turn_rad, aside_m))
         self._forget_before(end_s - WINDOW_S)
-        if end_s - self._compared_s < EVERY_S:
+        if end_s - self._compared_s < LAG_STEP_S:
             return
         self._compared_s = end_s
         starts, ends, *seen = np.array(self._steps).T
@@ -202,7 +198,7 @@ def _finding(
     # 3. The limit: a share of the way, and the motion within the lag that is in order.
     is_whole = count <= len(path) or _is_long(starts, ends) or not is_distance
     limit = max(SCALE_SHARE * (length if is_whole else WINDOW_M), least)
-    limit += LAG_SIGMA_S * float((np.abs(seen) / np.maximum(times_s, LAG_STEP_S / 5)).max())
+    limit += ALLOWED_LAG_S / 3 * float((np.abs(seen) / np.maximum(times_s, LAG_STEP_S / 5)).max())
     excess = abs(apart) / limit
     # 4. Of a distance the newest second alone as well, which may show a doubt sooner.
     if is_distance:
@@ -222,7 +218,7 @@ def _lag(by_lag: Array, seen: Array) -> tuple[int, int, bool]:
     best = int(np.argmin(squares))
     variance = squares[best] / len(seen) + STEP_SIGMA**2
     # Of a steady motion any lag is as good: without evidence it is near 0.
-    near = int(allowed[np.argmin((squares + variance * (LAGS_S / LAG_SIGMA_S) ** 2)[allowed])])
+    near = int(allowed[np.argmin((squares + variance * (3 * LAGS_S / ALLOWED_LAG_S) ** 2)[allowed])])
     is_strong = squares[near] - squares[best] > EVIDENCE * variance and squares[near] > WORSE * squares[best]
     return best, near, bool(is_strong and best not in allowed)
 
@@ -243,7 +239,7 @@ def _aside(spans: tuple[Array, Array, Array], turns: Array, aside: Array) -> _Fi
 
 def _is_long(starts: Array, ends: Array) -> bool:
     """True if steps fill the window of time."""
-    return bool(ends[-1] - starts[0] >= WINDOW_S - LEAST_STEPS * EVERY_S)
+    return bool(ends[-1] - starts[0] >= WINDOW_S - LEAST_STEPS * LAG_STEP_S)
 
 
 class Contradiction:

@@ -21,7 +21,18 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.odometry.exposure_times import RigVelocity
-from omnid.core.odometry.motion_sensors import AHEAD, DISTANCE, TURN, YAW, MotionSensors, Twist, at_rest, on_a_plane
+from omnid.core.odometry.motion_sensors import (
+    ACCELERATION_SIGMAS,
+    AHEAD,
+    DISTANCE,
+    TURN,
+    YAW,
+    MotionSensors,
+    Twist,
+    at_rest,
+    on_a_plane,
+)
+from omnid.core.odometry.pose_estimation import OUTLIER_SQUARED
 
 Array = NDArray[np.float64]
 
@@ -29,24 +40,20 @@ VELOCITY, ACCELERATION, SENSORS, POSE, SIZE = slice(0, 6), slice(6, 12), slice(1
 # Spectral density of the jerk for translation and rotation, (m/s^3)^2/Hz and (rad/s^3)^2/Hz, of a wheeled robot.
 # Measured: with 0.67 and 1.5 times as much the odometry errs 0.98 to 1.01 times as much, but for one log at 1152 px
 JERK_PSD = (10.0, 40.0)
-START_VELOCITY_VARIANCE = 1.0  # (m/s)^2 and (rad/s)^2 of a motion that is not known yet.
-START_ACCELERATION_VARIANCE = 4.0  # (m/s^2)^2 and (rad/s^2)^2.
 MIN_VELOCITY_VARIANCE = 1e-10  # added to each measurement, so that its covariance can be inverted
-# Standard deviation of the velocity while nothing measures it, m/s and rad/s: indoor vehicles are seldom twice as fast.
+# Standard deviation of the velocity at the start and while nothing measures it, m/s and rad/s, since
+# indoor vehicles are seldom twice as fast.
 UNKNOWN_SPEED_SIGMA = 0.5
 SLOWING_S = 0.3  # time constant of the predicted velocity's decay meanwhile
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # of a pose, m and rad: larger ones would leave no digits to differences
-# Errors of wheels and gyro at the start, their standard deviations, those of their random walks over one second, and
-# those after many steps that do not agree, so large that all is learned again.
+# Errors of wheels and gyro at the start, their standard deviations, and those of their random walks over one second.
+# After many steps that do not agree the deviations are ten times as large, so that all is learned again.
 START = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 START_SIGMA = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
 WALK_SIGMA = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
-LOST_SIGMA = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])
 STATES_OF = {WheelSample: slice(0, 3), GyroSample: slice(3, 7)}
 SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales: beyond them their settings are wrong.
 CAMERA_SIGMA = np.repeat([3e-4, 1e-4], 3)  # of the cameras' step, m and rad, in addition to its covariance
-# A larger difference from the cameras' step means that a sensor slips or is wrong: noise makes one of 16,000 so large.
-GATE_SIGMAS = 4.0
 # Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,
 # because each step is another measurement. After the larger number the sensor counts as not calibrated.
 SLIPPING, MOST_OUTLIERS = 2, 40
@@ -84,7 +91,7 @@ class MotionFilter:
     def reset(self) -> None:
         """Reset to standstill, with the uncertainty of what a robot can do."""
         self._filter.x[:12] = 0.0
-        self._set_covariance(slice(0, 12), np.repeat([START_VELOCITY_VARIANCE, START_ACCELERATION_VARIANCE], 6))
+        self._set_covariance(slice(0, 12), np.repeat([UNKNOWN_SPEED_SIGMA, ACCELERATION_SIGMAS[1]], 6) ** 2)
         self._last_step: tuple[Array, float] | None = None  # T_prev_curr that was accepted last, and its time
         self._is_unknown = False  # nothing measures the velocity
 
@@ -134,7 +141,7 @@ class MotionFilter:
     @staticmethod
     def of_step(T_prev_curr: Array, dt_s: float) -> RigVelocity:
         """Return the velocity at either end of a single step, which changes by an acceleration that is not known."""
-        return RigVelocity(se3.log(T_prev_curr) / dt_s, START_ACCELERATION_VARIANCE * (dt_s / 2) ** 2 * np.eye(6))
+        return RigVelocity(se3.log(T_prev_curr) / dt_s, (ACCELERATION_SIGMAS[1] * dt_s / 2) ** 2 * np.eye(6))
 
     def predict(self, dt_s: float) -> Array:
         """Predict the state dt_s later and return the expected motion T_prev_curr (4, 4)."""
@@ -269,7 +276,7 @@ class MotionFilter:
         """True if wheels and gyro measure turns in a step that differ by more than their errors."""
         H = wheels[YAW].slopes - gyro[YAW].slopes
         variance = wheels[YAW].variance + gyro[YAW].variance + H @ self._filter.P[SENSORS, SENSORS] @ H
-        return bool((wheels[YAW].value - gyro[YAW].value) ** 2 > GATE_SIGMAS**2 * variance)
+        return bool((wheels[YAW].value - gyro[YAW].value) ** 2 > OUTLIER_SQUARED * variance)
 
     def _compare(self, interval_s: tuple[float, float], dt_s: float) -> None:
         """Update with what the sensors measured in a step of the cameras, and count where they disagree with it."""
@@ -282,11 +289,11 @@ class MotionFilter:
             if not twist:
                 continue
             ratios = {axis: self._measure(twist, axis, values, dt_s, is_gated=True) for axis in twist}
-            agrees = all(ratio <= GATE_SIGMAS**2 for ratio in ratios.values())
+            agrees = all(ratio <= OUTLIER_SQUARED for ratio in ratios.values())
             if sensor is WheelSample:
                 self.slips += not agrees
                 for number, axis in enumerate((AHEAD, YAW)):
-                    if ratios.get(axis, math.inf) < GATE_SIGMAS**2:
+                    if ratios.get(axis, math.inf) < OUTLIER_SQUARED:
                         factor = self._noise_factors[number] * (1.0 + NOISE_GAIN * (ratios[axis] - 1.0))
                         self._noise_factors[number] = max(1.0, factor)
             else:
@@ -296,7 +303,7 @@ class MotionFilter:
                 # Its settings may be wrong: they are learned again.
                 self._outliers[sensor] = 0
                 states = STATES_OF[sensor]
-                self._set_covariance(slice(12 + states.start, 12 + states.stop), LOST_SIGMA[states] ** 2)
+                self._set_covariance(slice(12 + states.start, 12 + states.stop), 100 * START_SIGMA[states] ** 2)
 
     def _measure(self, twist: Twist, axis: int, values: Array, dt_s: float, *, is_gated: bool = False) -> float:
         """Update with one component of the base's twist; return the squared Mahalanobis distance of its innovation.
@@ -311,7 +318,7 @@ class MotionFilter:
         z = value - slopes @ values
         innovation = float(z - (H @ self._filter.x)[0, 0])
         ratio = innovation**2 / float((H @ self._filter.P @ H.T)[0, 0] + R)
-        if not is_gated or ratio <= GATE_SIGMAS**2:
+        if not is_gated or ratio <= OUTLIER_SQUARED:
             self._filter.update(np.array([[z]]), R=np.array([[R]]), H=H)
             self._symmetrise()
         return ratio

@@ -27,13 +27,13 @@ from calib import se3
 from omnid.core.odometry.correlation import normalised_patches
 from omnid.core.odometry.estimates import SAME_M, PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.tracking import PEAKS
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-MOST = 3  # peaks that are tried
 DECIDING_COST = math.log(1e6)  # logarithm of the odds that decide
 # Frames without a peak that end the other motion: noise hides one in 29.
 MOST_MISSED = math.ceil(DECIDING_COST / math.log(29))
@@ -41,15 +41,13 @@ MOST_MISSED = math.ceil(DECIDING_COST / math.log(29))
 REACH_SIGMAS = math.sqrt(2 * DECIDING_COST)
 DISPLACEMENT_ERROR = 0.02  # of a displacement as a share of it, to all sides: few millimetres of some decimetres
 LANDMARKS = 120  # whose patches are compared: the mean of so many correlations errs by less than 0.1
-# Side of a patch in samples and their distance, px: as wide as the tracker's window, and blurred by as much as a step
-# of the grid moves it.
-SAMPLES, SAMPLE_PX, BLUR_PX = 7, 2, 2.0
+# Side of a patch in samples and their distance, px: as wide as the tracker's window, and blurred by as much.
+SAMPLES, SAMPLE_PX = 7, 2
 STEP_PX = 5.0  # between two displacements at the median distance: half of it is what a tracker without pyramid reaches
 MOST_STEPS = 12  # to each side; a wider reach is searched in wider steps
 # Share of the mean correlation at the pose that another peak must reach: textures that do not repeat stay below 0.37 of
 # it on rendered logs, identical bricks reach 0.62 and more.
 PEAK_SHARE = 0.5
-MIN_PATCH_GREY = 1.0  # standard deviation of a patch with texture; noise has less
 
 
 class OtherMotion:
@@ -128,7 +126,7 @@ def displacements(
 ) -> list[Array]:
     """Return displacements (x, y) [m] of a pose, in its own axes, at which the last panorama's patches are seen too.
 
-    At most MOST, best first; the pose itself may be among them, as (0, 0). None if reach_m, the largest one that is
+    At most PEAKS, best first; the pose itself may be among them, as (0, 0). None if reach_m, the largest one that is
     searched, is less than a step of the grid.
     """
     # 1. The grid, and the patches in the last panorama.
@@ -144,7 +142,7 @@ def displacements(
     steps = math.ceil(reach_m / step_m)
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
     patches, contrast = normalised_patches(before, np.rint(table.pixels[rows]), SAMPLES, SAMPLE_PX, _blurred(before))
-    textured = contrast > MIN_PATCH_GREY
+    textured = contrast > before.noise_grey
     if not textured.any():
         return []
     # 2. Their mean correlation with the current one.
@@ -157,8 +155,8 @@ def displacements(
         scores[a] = each[:, textured].mean(axis=1)
     # 3. Its peaks.
     is_peak = (scores == cv2.dilate(scores, np.ones((3, 3)))) & (scores > PEAK_SHARE * scores[steps, steps])
-    return [offsets[at] for at in sorted(np.argwhere(is_peak), key=lambda at: -scores[tuple(at)])[:MOST]]
+    return [offsets[at] for at in sorted(np.argwhere(is_peak), key=lambda at: -scores[tuple(at)])[:PEAKS]]
 
 
 def _blurred(panorama: PaddedPanorama) -> NDArray[np.float32]:
-    return np.asarray(cv2.GaussianBlur(panorama.image.astype(np.float32), (0, 0), BLUR_PX), np.float32)
+    return np.asarray(cv2.GaussianBlur(panorama.image.astype(np.float32), (0, 0), SAMPLE_PX), np.float32)

@@ -27,9 +27,9 @@ AHEAD, YAW = 0, 5  # components of the twist of the base that wheels measure
 WHEEL_SHARES, WHEEL_LEAST, GYRO_RADPS_SQRT_S = (0.01, 0.02), (3e-4, 5e-4), 1e-3
 # Wheels roll forwards on a plane: lateral error as a share of the way and at least, vertical error, roll and pitch.
 SIDE_SHARE, SIDE_M, HEIGHT_M, TILT_RAD = 0.01, 3e-4, 5e-4, 1e-3
-# Sigmas of the change of the rates, m/s^2 and rad/s^2, where samples of the end of a step have not come yet: about half
-# of the most that controller.limits allows by default, 1.5 m/s^2 and 3 rad/s^2.
-NOT_YET: Final = (1.0, 2.0)
+# Sigmas of an acceleration that is not known, m/s^2 and rad/s^2: about half of the most that controller.limits allows
+# by default, 1.5 m/s^2 and 3 rad/s^2.
+ACCELERATION_SIGMAS: Final = (1.0, 2.0)
 # At rest: rates of wheels [m/s, rad/s] and of the gyro without its bias, also for this time before the step, so that
 # nothing swings on; and the motion that is left, m and rad.
 STILL_WHEELS, STILL_GYRO, STILL_BEFORE_S = np.array([0.003, 0.01]), 0.03, 0.2
@@ -143,7 +143,7 @@ class MotionSensors:
             if math.isfinite(amount):
                 slopes[state], slopes[WHEEL_OFFSET] = amount, -states[state] * changes[number]
                 noise = noise_factors[number] * ((WHEEL_SHARES[number] * amount) ** 2 + WHEEL_LEAST[number] ** 2)
-                late = NOT_YET[number] * missing_s**2 / 2
+                late = ACCELERATION_SIGMAS[number] * missing_s**2 / 2
                 found[axis] = Measured(float(states[state] * amount), slopes, noise + late**2)
         return found
 
@@ -153,7 +153,7 @@ class MotionSensors:
         amounts, found, dt_s = self.motion(GyroSample, start_s, end_s, states), Twist(), end_s - start_s
         if not np.isfinite(amounts).all():
             return found
-        changes, late = self._gyro.change(start_s, end_s), NOT_YET[1] * self._gyro.missing_s(end_s) ** 2 / 2
+        changes, late = self._gyro.change(start_s, end_s), ACCELERATION_SIGMAS[1] * self._gyro.missing_s(end_s) ** 2 / 2
         for axis in range(3):
             slopes = np.zeros(len(states))
             slopes[BIAS.start + axis], slopes[GYRO_OFFSET] = -dt_s, -changes[axis]

@@ -34,11 +34,8 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
-# Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
-TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
-# Share of the landmarks in view, inliers, below which a pose after a break is doubtful. Wrong ones at 10 m/s before a
-# limit of 5 had 0.09, 0.24 and 0.27 (set on seed 3 of `honesty`, too fast).
-AGAIN_SHARE = 1 / 3
+# Corners per landmark of the smallest map that make a frame textured, since not all will be located.
+TEXTURED_CORNERS = 2
 # Parts of the full turn, half of which few inliers must fill to support a pose, and the least share of the tracks.
 AROUND, NEARLY_ALL = 12, 0.9
 # A larger step of odom would be a jump for the readers of published poses, as REP 105 has odom continuous: it raises
@@ -241,14 +238,15 @@ class VisualOdometry:
 
     def _is_doubtful(self, plausible: list[PoseEstimate]) -> bool:
         """True if no pose is plausible, or it has too few inliers to be relied on after an unknown motion."""
+        limits = self._limits
         return not plausible or plausible[0].inliers < min(
-            self._limits.good_inliers, AGAIN_SHARE * plausible[0].visible
+            limits.good_inliers, limits.min_inlier_ratio * plausible[0].visible
         )
 
     def _is_textured(self, now: _Prediction) -> bool:
         """True if the frame has enough corners for a map."""
-        smallest = self._limits.min_inliers
-        return len(corners(now.frame.lower, now.usable, COUNTED_CORNERS * smallest)) >= TEXTURED_CORNERS * smallest
+        least = TEXTURED_CORNERS * self._limits.min_inliers
+        return len(corners(now.frame.lower, now.usable, least)) >= least
 
     def _accept(self, now: _Prediction, estimate: PoseEstimate, *, is_reset: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""

@@ -27,6 +27,12 @@ CONVERGED = 1e-5  # m and rad: a smaller step is the last one, because it moves 
 # Standard deviations at which the Cauchy kernel halves the weight of an error, so that of normal errors 96 % of the
 # efficiency of least squares remains (2.385: 95 %, Holland and Welsch 1977).
 KERNEL_WIDTH = 2.5
+# Squared Mahalanobis distance from which a measurement is an outlier: 4 sigma. Of normal errors of a view, which has
+# three components, one in a thousand is farther away, so that hardly any is lost.
+OUTLIER_SQUARED = 16.0
+# Measurements that count as one in a covariance: neighbouring landmarks have texture, depth and keyframe in common, and
+# a landmark its texture in successive frames, so that their errors are correlated.
+CORRELATED = 4.0
 DAMPING = 1e-9  # added to the normal equations' diagonal, so that few landmarks do not make them singular
 
 

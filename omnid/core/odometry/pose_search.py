@@ -12,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.corners import REACH_PX
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.local_map import LocalMap, Tracks
-from omnid.core.odometry.motion_hypotheses import displacements
+from omnid.core.odometry.motion_hypotheses import LANDMARKS, displacements
 from omnid.core.odometry.plane_patches import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import (
+    CORRELATED,
     KERNEL_WIDTH,
+    OUTLIER_SQUARED,
     GaussNewtonResult,
     SharedError,
     gauss_newton,
@@ -34,32 +37,19 @@ Indices = NDArray[np.intp]
 
 # Fewer landmarks are no estimate of six unknowns, because three determine them, and as many must confirm it.
 MIN_LANDMARKS = 6
-# Squared Mahalanobis distance from which a view is an outlier: 4 sigma in one of its three components. Of views with
-# normal errors one in a thousand is farther away, so that hardly any is lost.
-OUTLIER_SQUARED = 16.0
 # Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before. Measured on `rooms` 6 and
 # `struts` 5 at 384 px: in 99 % of the frames the last round ends within 0.02 sigmas of where 50 steps lead, and the
 # coarse one within 0.24.
 COARSE_STEPS, STEPS = (3,), (2, 4)
 # Refinements of a recognised pose: the first one brings most patches into reach, the second one aligns them all.
 RECOGNISED_ROUNDS = 2
-# Landmarks tracked for each yaw hypothesis, because the share that is kept is then known to 4 %: sqrt(0.5^2 / 150).
-YAW_SAMPLE = 150
 # Standard deviation of a track whose patch was not yet warped to the new viewpoint.
 COARSE_SIGMA_PX = 0.3
-# Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
-# errors are correlated.
-CORRELATED_LANDMARKS = 4.0
-# Expected value of the squared Mahalanobis distance of a view, because that is a sum of three squares, each with an
-# expected value of 1.
-VIEW_DIMENSIONS = 3
 # Cost of a landmark that is no inlier: that of the last one.
-OUTLIER_COST = KERNEL_WIDTH**2 / 2 * math.log1p(OUTLIER_SQUARED / KERNEL_WIDTH**2) / CORRELATED_LANDMARKS
+OUTLIER_COST = KERNEL_WIDTH**2 / 2 * math.log1p(OUTLIER_SQUARED / KERNEL_WIDTH**2) / CORRELATED
 # Share of the predicted landmarks, tracked, below which another guess is tried; the same of inliers near a guess, as
 # without a pyramid tracks stay, in noise, near a wrong prediction and confirm it.
 GOOD_RATIO = 0.5
-# From where a landmark's depth puts it in the upper panorama: a depth that is farther off is an outlier.
-UPPER_REACH_PX = 3
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
 # start of the refinement, which aligns the patches of all landmarks.
 TRACKED_SHARE = 0.6
@@ -112,7 +102,7 @@ class PoseSearch:
             se3.transform(T_last[:3, :3] @ se3.rotation_exp([0, 0, yaw_rad]), T_predicted[:3, 3])
             for yaw_rad in correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
         ]
-        tracks = [self._map.track(frame.lower, T_guess, most=YAW_SAMPLE) for T_guess in guesses]
+        tracks = [self._map.track(frame.lower, T_guess, most=LANDMARKS) for T_guess in guesses]
         return guesses[int(np.argmax([len(each.landmarks) / max(1, each.visible) for each in tracks]))]
 
     def others(
@@ -156,12 +146,13 @@ class PoseSearch:
         in_guess = se3.apply(T_guess_odom, self._map.table.points[tracks.landmarks])
         slopes = self._map.slopes(T_odom_guess, tracks.landmarks)
         shift = exposure.shift(in_guess)
-        # 1. The rows in the upper panorama, where the patches must fit; a wrong one is an outlier of the pose.
+        # 1. The rows in the upper panorama, where the patches must fit within REACH_PX of where the depths put them; a
+        #    wrong one is an outlier of the pose.
         guess = tracks.pixels + shift.lower - shift.upper
         guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
         spread_px = 2 * shift.column_sigma(exposure.motion)
         pair = frame.lower, frame.upper
-        rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, UPPER_REACH_PX, spread_px)
+        rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, REACH_PX, spread_px)
         disparity = rows - tracks.pixels[:, 1]
         views = np.column_stack([tracks.pixels, rows]) + np.column_stack([shift.lower, shift.upper[:, 1]])
         # 2. RANSAC and Gauss-Newton.
@@ -197,14 +188,15 @@ class PoseSearch:
         views += np.column_stack([shift.lower, shift.upper[:, 1]])[aligned.found]
         # 3. Solve for the pose and the velocity. The prior of the velocity is one measurement: unlike the landmarks'
         # errors it is not correlated with others.
-        covariance = exposure.motion.covariance / CORRELATED_LANDMARKS
+        covariance = exposure.motion.covariance / CORRELATED
         by_motion = SharedError(shift.by_motion[aligned.found, :3], covariance)
         solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
         if solution is None:
             return None
-        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it.
+        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it. A squared distance is
+        #    a sum of as many squares as a view has numbers, each with an expected value of 1.
         T_odom_rect = se3.inverse(solution.T)
-        scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
+        scale = CORRELATED * max(1.0, float(solution.squared.mean()) / views.shape[1])
         variance = variance[landmarks]
         # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
         # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
@@ -307,5 +299,5 @@ def _cost(squared: Array, in_view: int) -> float:
     that count as one; an outlier costs what the last inlier does.
     """
     width2 = KERNEL_WIDTH**2
-    inliers = width2 / 2 * float(np.log1p(squared / width2).sum()) / CORRELATED_LANDMARKS
+    inliers = width2 / 2 * float(np.log1p(squared / width2).sum()) / CORRELATED
     return (inliers + (in_view - len(squared)) * OUTLIER_COST) / max(1, in_view)

@@ -12,19 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.odometry.patch_kernels import CONVERGED_PX
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
-CONVERGED_PX = 0.01  # OpenCV's default: an iteration that moves the window less is the last one
 STEP_RAD = math.radians(18)  # the paper's step, Dang et al. 2012, section IV.F
-PEAKS = 3  # Peaks of the correlation that are tried.
-# Two peaks are at least a 36th of a full turn apart: 10 degrees, because nearer ones would be two samples of one peak.
-PEAKS_APART = 36
+PEAKS = 3  # Peaks of the correlation that are tried, at least half of a step apart.
 MAX_GRADIENT = 100.0  # grey levels, Sobel: stronger edges are cut, so that none dominates the correlation
-ROW_STEP = 2  # every second row is enough for the correlation
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +98,7 @@ def correlation_peaks(before: Image, after: Image, usable: Flags, turn_px: int =
     width = turn_px or before.shape[1]
     spectrum = np.conj(_spectrum(before, usable, width)) * _spectrum(after, usable, width)
     score = np.fft.irfft(spectrum.sum(axis=0), width)
-    apart = width // PEAKS_APART
+    apart = round(width * STEP_RAD / (4 * math.pi))
     peaks = []
     for _ in range(PEAKS):
         shift = int(score.argmax())
@@ -111,8 +108,8 @@ def correlation_peaks(before: Image, after: Image, usable: Flags, turn_px: int =
 
 
 def _spectrum(image: Image, usable: Flags, turn_px: int) -> NDArray[np.complex64]:
-    """Return the spectrum (H / ROW_STEP, turn / 2 + 1) over azimuth of the horizontal gradient."""
+    """Return the spectrum (H, turn / 2 + 1) over azimuth of the horizontal gradient."""
     wrapped = np.hstack([image[:, -1:], image, image[:, :1]])
     gradient = cv2.Sobel(wrapped, cv2.CV_32F, 1, 0)[:, 1:-1]
     limited = np.clip(gradient, -MAX_GRADIENT, MAX_GRADIENT) * usable
-    return np.fft.rfft(limited[::ROW_STEP], turn_px, axis=1).astype(np.complex64)
+    return np.fft.rfft(limited, turn_px, axis=1).astype(np.complex64)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import Keyframe
-from omnid.core.odometry.pose_estimation import gauss_newton, ransac
-from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS, OUTLIER_SQUARED, VIEW_DIMENSIONS
+from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import FEATURES, Signature, Thumbnail, describe, signature_of, similarities
 from omnid.core.places.place_map import PlaceFeatures, PlaceLimits, PlaceMap
@@ -220,7 +219,7 @@ def recognise(
     if count < MIN_MATCHES:
         return None
     azimuth = np.floor(views[b2[kept], 0] * (SECTORS / cylinder.width)).astype(int) % SECTORS
-    covariance = CORRELATED_LANDMARKS * max(1.0, float(errors[kept].mean()) / VIEW_DIMENSIONS) * covariance + FLOOR
+    covariance = CORRELATED * max(1.0, float(errors[kept].mean()) / views.shape[1]) * covariance + FLOOR
     return Recognition(id, se3.inverse(T), covariance, count, len(a), len(np.unique(azimuth)))
 
 

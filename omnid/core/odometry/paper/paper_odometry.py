@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners, nearby_disparity
-from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.paper.registration import Registration, consensus, register
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -30,17 +30,15 @@ Flags = NDArray[np.bool_]
 
 TRACKERS = ("improved", "klt")
 REFERENCES = ("previous", "keyframe")
-FEATURES = 500  # As the default of odometry.limits.features, so that the methods are compared with as many.
+FEATURES = OdometryLimits().features  # so that the methods are compared with as many
 # Share of the features that makes a yaw hypothesis good enough ("N is more than needed", section IV.F). Beyond the
-# ample share the search ends; between the two the next larger turn is tried as long as it finds more.
+# ample share the search ends; between the two the next larger turn is tried as long as it finds more. A keyframe with
+# less than it of its largest consensus set is replaced.
 ENOUGH_RATIO = 0.5
 AMPLE_RATIO = 0.85
-EPSILON_PX = 3  # eq. (8): largest distance of a located point from the feature that it locates
 THRESHOLD_M = 0.05  # largest 3-D error of a point of the consensus set, as in section IV.B
 # Points of the consensus set, below which the motion is refused, because three determine it and as many confirm it.
 MIN_INLIERS = 6
-# Share of a keyframe's largest consensus set, below which the current frame replaces it.
-KEYFRAME_RATIO = 0.5
 # Spectral density of the jerk, (m/s^3)^2/Hz and (rad/s^3)^2/Hz. The turns of section IV.F change the yaw rate by
 # radians per second within 0.1 s; a filter that takes this for impossible would shorten the turn and overshoot.
 JERK_PSD = (10.0, 4000.0)
@@ -111,7 +109,7 @@ class PaperOdometry:
         # 5. Filter the motion (section IV.D) and compose its inverse, the motion of the camera (eq. 12).
         self._move(reference, motion, dt_s)
         self._most_inliers = max(self._most_inliers, inliers)
-        if not self._keeps_reference or inliers < KEYFRAME_RATIO * self._most_inliers:
+        if not self._keeps_reference or inliers < ENOUGH_RATIO * self._most_inliers:
             self._set_reference(frame)
         # The motion in a gap is not known: odom goes on from another place.
         state = TrackingState.DEGRADED if self._untracked_s else TrackingState.TRACKING
@@ -182,7 +180,7 @@ def locate(frame: StereoFrame, features: Array, model: StereoModel) -> Array:
 
     NaN where no located point is near.
     """
-    disparity = nearby_disparity(frame.disparity, features, EPSILON_PX)
+    disparity = nearby_disparity(frame.disparity, features)
     views = np.column_stack([features, features[:, 1] + disparity])
     return triangulate(views, model.cylinder, model.baseline_m)
 
