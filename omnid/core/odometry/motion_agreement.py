@@ -43,6 +43,7 @@ from omnid.core.control.motion_monitor import (
     Difference,
 )
 from omnid.core.odometry.motion_filter import MotionFilter
+from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 
 Array = NDArray[np.float64]
 
@@ -63,7 +64,6 @@ ASIDE_SHARE, STRAIGHT_RADPM = 0.15, 0.1
 # half a degree a second; wheels whose diameters differ by 0.7 % turn by 4 degrees over 3 m, which is no doubt yet.
 LEAST_M, TURN_RAD, WHEEL_TURN_RAD = 0.05, math.radians(5.0), math.radians(15.0)
 STEP_SIGMA: Final = 0.003  # m and rad of a step, added to that of its residuals: roughness of floor and images
-EVIDENCE: Final = 50.0  # Twice the log-likelihood ratio: seven sigma, because a lag is searched in each pair.
 WORSE: Final = 3.0  # ratio of the sums of squares that the lag must explain, because slip makes both of them large
 LATE_S: Final = 0.5  # A lag is a fault after this time, because the newest steps are the noisiest.
 SCALES: Final = (0.3, 3.0)  # Scales of the motion in the search of a lag, because images may be slow as well as late.
@@ -219,7 +219,7 @@ def _lag(by_lag: Array, seen: Array) -> tuple[int, int, bool]:
     variance = squares[best] / len(seen) + STEP_SIGMA**2
     # Of a steady motion any lag is as good: without evidence it is near 0.
     near = int(allowed[np.argmin((squares + variance * (3 * LAGS_S / ALLOWED_LAG_S) ** 2)[allowed])])
-    is_strong = squares[near] - squares[best] > EVIDENCE * variance and squares[near] > WORSE * squares[best]
+    is_strong = squares[near] - squares[best] > 2 * DECIDING_COST * variance and squares[near] > WORSE * squares[best]
     return best, near, bool(is_strong and best not in allowed)
 
 

@@ -40,9 +40,9 @@ VELOCITY, ACCELERATION, SENSORS, POSE, SIZE = slice(0, 6), slice(6, 12), slice(1
 # Spectral density of the jerk for translation and rotation, (m/s^3)^2/Hz and (rad/s^3)^2/Hz, of a wheeled robot.
 # Measured: with 0.67 and 1.5 times as much the odometry errs 0.98 to 1.01 times as much, but for one log at 1152 px
 JERK_PSD = (10.0, 40.0)
+START_SPEED_SIGMA = 1.0  # m/s and rad/s, of a motion that is not known yet
 MIN_VELOCITY_VARIANCE = 1e-10  # added to each measurement, so that its covariance can be inverted
-# Standard deviation of the velocity at the start and while nothing measures it, m/s and rad/s, since
-# indoor vehicles are seldom twice as fast.
+# Standard deviation of the velocity while nothing measures it, m/s and rad/s: indoor vehicles are seldom twice as fast.
 UNKNOWN_SPEED_SIGMA = 0.5
 SLOWING_S = 0.3  # time constant of the predicted velocity's decay meanwhile
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # of a pose, m and rad: larger ones would leave no digits to differences
@@ -91,7 +91,7 @@ class MotionFilter:
     def reset(self) -> None:
         """Reset to standstill, with the uncertainty of what a robot can do."""
         self._filter.x[:12] = 0.0
-        self._set_covariance(slice(0, 12), np.repeat([UNKNOWN_SPEED_SIGMA, ACCELERATION_SIGMAS[1]], 6) ** 2)
+        self._set_covariance(slice(0, 12), np.repeat([START_SPEED_SIGMA, ACCELERATION_SIGMAS[1]], 6) ** 2)
         self._last_step: tuple[Array, float] | None = None  # T_prev_curr that was accepted last, and its time
         self._is_unknown = False  # nothing measures the velocity
 

@@ -48,6 +48,7 @@ MOST_STEPS = 12  # to each side; a wider reach is searched in wider steps
 # Share of the mean correlation at the pose that another peak must reach: textures that do not repeat stay below 0.37 of
 # it on rendered logs, identical bricks reach 0.62 and more.
 PEAK_SHARE = 0.5
+MIN_PATCH_GREY = 1.0  # standard deviation of a patch with texture; noise has less
 
 
 class OtherMotion:
@@ -142,7 +143,7 @@ def displacements(
     steps = math.ceil(reach_m / step_m)
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
     patches, contrast = normalised_patches(before, np.rint(table.pixels[rows]), SAMPLES, SAMPLE_PX, _blurred(before))
-    textured = contrast > before.noise_grey
+    textured = contrast > MIN_PATCH_GREY
     if not textured.any():
         return []
     # 2. Their mean correlation with the current one.

@@ -29,7 +29,6 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 WINDOW_PX = 13  # side of a patch
-TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the border that the gradient's 3x3 operator needs
 # Half the side of the window in which the slope of the dense disparity is taken.
 SLOPE_REACH_PX = 8
 # Disparities that differ by more belong to another surface.
@@ -71,6 +70,8 @@ def plane_templates(
     window_px: int = WINDOW_PX,
 ) -> Floats:
     """Return templates (N, T, T) of patches at pixels (N, 2) of images, less grey 128, as the current view shows them.
+
+    They hold the window and the border that the gradient's 3x3 operator needs.
 
     anchors (N,): the key of the image of each, one of the images. surfaces: points (N, 3) [m] at the patches' centres
     and slopes (N, 2) of the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from
@@ -184,7 +185,7 @@ def _in_upper(
 
 
 def align(templates: Floats, current: PaddedPanorama, predicted: Array, reach_px: int = REACH_PX) -> AlignedPatches:
-    """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
+    """Align templates (N, T, T), centred on predicted (N, 2), with the current panorama.
 
     reach_px: a patch that has to move this far was predicted wrongly.
     """

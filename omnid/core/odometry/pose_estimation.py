@@ -36,23 +36,6 @@ CORRELATED = 4.0
 DAMPING = 1e-9  # added to the normal equations' diagonal, so that few landmarks do not make them singular
 
 
-@dataclass(frozen=True, slots=True)
-class SharedError:
-    """An unknown error of K components that all N views have in common, such as that of a velocity."""
-
-    derivatives: Array  # (N, 3, K) px: of the true views by the error
-    covariance: Array  # (K, K)
-
-    @staticmethod
-    def none(count: int) -> SharedError:
-        """Return the error of no components for count views."""
-        return SharedError(np.zeros((count, 3, 0)), np.zeros((0, 0)))
-
-    def of(self, chosen: Flags) -> SharedError:
-        """Return the error of the views that are flagged (N,)."""
-        return SharedError(self.derivatives[chosen], self.covariance)
-
-
 def rigid_fit(a: Array, b: Array) -> Array:
     """Return T_b_a (..., 4, 4) that moves points a (..., N, 3) onto b with least squares (Kabsch), no reflection."""
     mean_a, mean_b = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
@@ -105,7 +88,6 @@ class GaussNewtonResult:
     T: Array
     covariance: Array
     squared: Array  # (N,) squared Mahalanobis distance
-    shared: Array  # (K,) the shared error that was found
 
 
 def gauss_newton(
@@ -116,32 +98,32 @@ def gauss_newton(
     model: StereoModel,
     noise: Array | None = None,
     steps: int = GAUSS_NEWTON_STEPS,
-    shared: SharedError | None = None,
+    shared: tuple[Array, Array] | None = None,
 ) -> GaussNewtonResult:
     """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
     a view by its corner (sigma_px, and noise (N, 3, 3) [px^2] in addition to it; None: none) and by its landmark
-    (covariance (N, 3, 3)). A shared error is estimated along with the motion. A view without the upper row (NaN)
-    counts by the lower camera alone. It replaces eq. (9) of Dang et al. 2012, which measures in 3-D and is biased
-    short.
+    (covariance (N, 3, 3)). shared: derivatives (N, 3, K) [px] of the true views by an error of K components that all
+    have in common, such as that of a velocity, and its covariance (K, K); it is estimated along with the motion. A view
+    without the upper row (NaN) counts by the lower camera alone. It replaces eq. (9) of Dang et al. 2012, which
+    measures in 3-D and is biased short.
     """
-    shared = SharedError.none(len(views)) if shared is None else shared
-    size = 6 + len(shared.covariance)
+    by_error, of_error = (np.zeros((len(views), 3, 0)), np.zeros((0, 0))) if shared is None else shared
+    size = 6 + len(of_error)
     prior = np.diag(np.full(size, DAMPING))
-    if len(shared.covariance):
-        prior[6:, 6:] += np.linalg.inv(shared.covariance)
+    if len(of_error):
+        prior[6:, 6:] += np.linalg.inv(of_error)
     of_corner = model.sigma_px**2 * np.eye(3)
     S = np.tile(of_corner, (len(views), 1, 1)) if noise is None else np.ascontiguousarray(of_corner + noise)
     T, error, squared, inverse = np.array(T), np.zeros(size - 6), np.empty(len(views)), np.empty((size, size))
     landmarks, covariance, views = map(np.ascontiguousarray, (landmarks, covariance, views))
-    derivatives = np.ascontiguousarray(shared.derivatives)
     solve(
         landmarks,
         covariance,
         views,
         S,
-        derivatives,
+        np.ascontiguousarray(by_error),
         prior,
         model.camera,
         KERNEL_WIDTH,
@@ -152,4 +134,4 @@ def gauss_newton(
         squared,
         inverse,
     )
-    return GaussNewtonResult(T, inverse[:6, :6], squared, error)
+    return GaussNewtonResult(T, inverse[:6, :6], squared)

@@ -23,7 +23,6 @@ from omnid.core.odometry.pose_estimation import (
     KERNEL_WIDTH,
     OUTLIER_SQUARED,
     GaussNewtonResult,
-    SharedError,
     gauss_newton,
     ransac,
 )
@@ -189,8 +188,9 @@ class PoseSearch:
         # 3. Solve for the pose and the velocity. The prior of the velocity is one measurement: unlike the landmarks'
         # errors it is not correlated with others.
         covariance = exposure.motion.covariance / CORRELATED
-        by_motion = SharedError(shift.by_motion[aligned.found, :3], covariance)
-        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
+        by_motion = shift.by_motion[aligned.found, :3]
+        shared = by_motion, covariance
+        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, shared)
         if solution is None:
             return None
         # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it. A squared distance is
@@ -201,7 +201,7 @@ class PoseSearch:
         # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
         # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
         # and the scale would drift.
-        of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
+        of_depth = by_motion[:, 2] - by_motion[:, 1]
         assumed = AssumedMotion(exposure.motion, of_depth[kept])
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
         is_kept = np.zeros(len(self._map), bool)
@@ -253,7 +253,7 @@ class PoseSearch:
         T_curr_odom: Array,
         model: StereoModel,
         noise: Array,
-        shared: SharedError | None = None,
+        shared: tuple[Array, Array] | None = None,
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
         kept, solution, table = np.ones(len(landmarks), bool), None, self._map.table
@@ -261,7 +261,7 @@ class PoseSearch:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
             points, covariance = table.points[landmarks[kept]], table.covariance[landmarks[kept]]
-            shared_error = None if shared is None else shared.of(kept)
+            shared_error = None if shared is None else (shared[0][kept], shared[1])
             solution = gauss_newton(
                 points, covariance, views[kept], T_curr_odom, model, noise[kept], steps, shared_error
             )

@@ -18,6 +18,7 @@ from omnid.core.odometry.corners import corners, nearby_disparity
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.paper.registration import Registration, consensus, register
+from omnid.core.odometry.pose_search import MIN_LANDMARKS
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings, flow, steps, track
 from omnid.core.stereo.triangulation import triangulate, view
@@ -37,8 +38,6 @@ FEATURES = OdometryLimits().features  # so that the methods are compared with as
 ENOUGH_RATIO = 0.5
 AMPLE_RATIO = 0.85
 THRESHOLD_M = 0.05  # largest 3-D error of a point of the consensus set, as in section IV.B
-# Points of the consensus set, below which the motion is refused, because three determine it and as many confirm it.
-MIN_INLIERS = 6
 # Spectral density of the jerk, (m/s^3)^2/Hz and (rad/s^3)^2/Hz. The turns of section IV.F change the yaw rate by
 # radians per second within 0.1 s; a filter that takes this for impossible would shorten the turn and overshoot.
 JERK_PSD = (10.0, 4000.0)
@@ -97,7 +96,7 @@ class PaperOdometry:
         # 2. Eliminate outliers by RANSAC on three points (section IV.B).
         M, is_inlier = consensus(X_a, X_b, np.random.default_rng(frame.seq), THRESHOLD_M)
         inliers = int(is_inlier.sum())
-        if inliers < MIN_INLIERS:
+        if inliers < MIN_LANDMARKS:
             return self._refuse(frame, dt_s, len(X_a), inliers)
 
         # 3. Estimate the motion of the points by Gauss-Newton (section IV.C, eq. 9).
@@ -197,7 +196,7 @@ def refine(
 
     The paper names this step and does not describe it. Here KLT starts where the motion predicts each feature, so that
     features are found that the first search missed or tracked badly; those within THRESHOLD_M of the motion take part
-    in eq. (9) once more. With fewer than MIN_INLIERS of them the motion is returned as it is.
+    in eq. (9) once more. With fewer than MIN_LANDMARKS of them the motion is returned as it is.
     """
     X_a = locate(previous, features, model)
     known = np.isfinite(X_a).all(axis=1)
@@ -207,7 +206,7 @@ def refine(
     X_a, X_b = X_a[found], locate(current, pixels[found], model)
     error_m = np.linalg.norm(se3.apply(motion.M, X_a) - X_b, axis=1)
     is_inlier = error_m < THRESHOLD_M  # false for NaN
-    if is_inlier.sum() < MIN_INLIERS:
+    if is_inlier.sum() < MIN_LANDMARKS:
         return motion
     return register(X_a[is_inlier], X_b[is_inlier], motion.M)
 

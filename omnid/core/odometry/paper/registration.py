@@ -8,14 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_estimation import rigid_fit
+from omnid.core.odometry.pose_estimation import CONVERGED, GAUSS_NEWTON_STEPS, rigid_fit
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 HYPOTHESES = 200  # of RANSAC, because if half of the points are wrong, (1 - 0.5^3)^200 = 3e-12 of the searches fail.
-STEPS = 10  # Gauss-Newton steps; enough: 351 motions of test_paper_odometry.py took 2 to 5.
-CONVERGED = 1e-9  # rad and m: a smaller step is the last one, because what is left is far below any noise
 MIN_POINTS = 3  # because fewer leave a rotation about their line open
 
 X, Y, Z = np.eye(3)
@@ -69,7 +67,7 @@ def register(a: Array, b: Array, M: Array) -> Registration:
     residuals (White 1980), so it includes that far points are noisier, which eq. (9) ignores; it excludes the bias.
     """
     parameters = euler_parameters(M)
-    for _ in range(STEPS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         J, error = _linearised(a, b, parameters)
         step = np.linalg.lstsq(J.reshape(-1, 6), error.ravel(), rcond=None)[0]
         parameters = parameters + step

@@ -206,13 +206,3 @@ def test_a_fault_stays_in_a_later_pose_and_turns_with_it() -> None:
     contradiction.add(Conflict(IMAGES_OR_WHEELS, "", True, Difference(0.4, 6.0)), pose(1.0), 1.0)
     later = contradiction.add(AGREE, pose(1.0, np.pi / 2), 9.0)
     assert np.diag(later)[:3] == pytest.approx([0.0, 0.4**2, 0.0], abs=1e-9)
-
-
-def test_a_doubt_is_over_with_its_reason() -> None:
-    """Until then the pose may be off by it, beside what a fault has left."""
-    doubt, fault = (Conflict(IMAGES_OR_WHEELS, "", is_fault, Difference(0.2, 6.0)) for is_fault in (False, True))
-    contradiction = Contradiction()
-    assert contradiction.add(doubt, pose(0.0), 1.0)[0, 0] == pytest.approx(0.2**2)
-    assert not contradiction.add(AGREE, pose(0.0), 2.0).any()
-    contradiction.add(fault, pose(0.0), 3.0)
-    assert contradiction.add(doubt, pose(0.0), 6.0)[0, 0] == pytest.approx((0.2 + 0.2 * 3 / 6) ** 2)

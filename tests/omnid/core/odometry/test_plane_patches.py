@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.plane_patches import (
-    TEMPLATE_PX,
     align,
     fitted_slopes,
     plane_templates,
@@ -90,7 +89,7 @@ def test_patches_of_a_wall_are_the_pixels_of_the_other_view(upper: bool) -> None
     seen = seen_at(points, upper)
     current = panorama(se3.inverse(T_CURR_REF), MODEL.baseline_m if upper else 0.0)
     exact = templates_of((points, slopes), pixels, seen, upper=upper)
-    half = TEMPLATE_PX // 2
+    half = exact.shape[1] // 2
     shown = [
         current.image[row - half : row + half + 1, PAD_PX + column - half : PAD_PX + column + half + 1]
         for column, row in np.rint(seen).astype(int).tolist()

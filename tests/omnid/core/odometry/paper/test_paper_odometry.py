@@ -1,4 +1,4 @@
-"""The paper's ego-motion: its equations, its trackers, step 4 of figure 5, registration, and a short rendered run."""
+"""The paper's ego-motion: its equations, its trackers, and a short rendered run."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.paper.paper_odometry import (
-    FEATURES,
     UNKNOWN_SPEED_SIGMA,
     PaperOdometry,
-    refine,
     turned_track,
 )
-from omnid.core.odometry.paper.registration import Registration, consensus
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.tracking_state import TrackingState
@@ -59,18 +56,6 @@ def test_a_path_through_a_right_angle(cameras: RenderedCameras, frames: list[Ste
     assert sigmas.min() > 5e-4 and sigmas.max() < 0.02
 
 
-def test_step_4_refines_a_rough_motion(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    """Figure 5: KLT started at the predicted features; 15 mm and half a degree off become a few millimetres."""
-    pair = frames[1], frames[2]
-    truth = se3.inverse(PATH[2]) @ PATH[1]
-    rough = truth @ se3.exp([0.01, -0.01, 0.0, 0.0, 0.0, 0.009])
-    features = corners(pair[0].lower, pair[0].usable, FEATURES)
-    refined = refine(*pair, features, Registration(rough, np.eye(6)), cameras.model, KltSettings())
-    distance, angle = motion_errors(refined.M, truth)
-    assert distance < 0.005 and angle < 0.002
-    assert distance < 0.5 * motion_errors(rough, truth)[0]
-
-
 @pytest.mark.parametrize("tracker", ["improved", "klt"])
 def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: list[StereoFrame], tracker: str) -> None:
     odometry = PaperOdometry(cameras.model, KltSettings(), tracker)
@@ -89,24 +74,3 @@ def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: l
     assert (after.state, after.resets) == (TrackingState.TRACKING, 1)
     moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
-
-
-Array = NDArray[np.float64]
-
-
-MOTION = se3.exp([0.1, -0.05, 0.02, 0.05, -0.1, 1.6])
-
-
-def cloud(count: int, seed: int = 0) -> Array:
-    """Points (N, 3) [m] on all sides."""
-    return np.random.default_rng(seed).normal(0, 1.5, (count, 3))
-
-
-def test_the_consensus_set_is_found_among_outliers() -> None:
-    a = cloud(100)
-    b = se3.apply(MOTION, a) + np.random.default_rng(1).normal(0, 0.005, (100, 3))
-    b[:60] = cloud(60, 2)
-    M, agree = consensus(a, b, np.random.default_rng(3), 0.05)
-    assert agree[60:].mean() > 0.9 and agree[:60].sum() <= 3
-    assert motion_errors(M, MOTION)[0] < 0.05
-    assert not consensus(a[:2], b[:2], np.random.default_rng(3), 0.05)[1].any()
