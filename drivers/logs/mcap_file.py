@@ -9,11 +9,11 @@ counted in a corrupt chunk.
 
 from __future__ import annotations
 
-import mmap
+import os
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from io import BytesIO
@@ -44,6 +44,27 @@ _END: Final = struct.Struct("<BQQ8xI8s")
 _FAULTS: Final = (McapError, struct.error, OSError, EOFError, RuntimeError, ValueError, MemoryError, OverflowError)
 
 
+class _FileBytes:
+    """The bytes of a file that had this size when it was opened; those that are gone since then are left out.
+
+    They are read and not mapped: a mapped file that is truncated meanwhile would kill the process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.file = path.open("rb", buffering=0)
+        self._size = os.fstat(self.file.fileno()).st_size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> memoryview:
+        begin, end, _ = part.indices(self._size)
+        try:
+            return memoryview(os.pread(self.file.fileno(), max(0, min(end - begin, MAX_RECORD_BYTES)), begin))
+        except (OSError, ValueError):  # a fault of the disk, or it was closed
+            return memoryview(b"")
+
+
 class Record(NamedTuple):
     """A record; the content of one that is cut is shorter."""
 
@@ -53,15 +74,15 @@ class Record(NamedTuple):
     content: memoryview
 
 
-def _records(source: memoryview, begin: int) -> Iterator[Record]:
+def _records(source: _FileBytes | memoryview, begin: int) -> Iterator[Record]:
     """Yield the records of a file or of an unpacked chunk; the last one may be cut. What is no record ends them."""
-    while begin + _HEAD.size <= len(source):
-        opcode, size = _HEAD.unpack_from(source, begin)
+    while len(head := source[begin : begin + _HEAD.size]) == _HEAD.size:
+        opcode, size = _HEAD.unpack(head)
         if opcode == 0:
             return
-        record = Record(opcode, begin, begin + _HEAD.size + size, source[begin + _HEAD.size :][:size])
-        yield record
-        begin = record.end
+        end = begin + _HEAD.size + size
+        yield Record(opcode, begin, end, source[begin + _HEAD.size : end])
+        begin = end
 
 
 class McapFile(LogFile):
@@ -69,24 +90,24 @@ class McapFile(LogFile):
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(name)
-        self._attached: list[memoryview] = []
+        self._attached: list[int] = []  # where they begin
         self._types = {0: ""}  # by schema; 0 stands for none
         self._chunk = lru_cache(_KEPT_CHUNKS)(self._unpacked)
         try:
-            with path.open("rb") as file:
-                self._data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-        except (OSError, ValueError) as error:
+            self._data = _FileBytes(path)
+        except OSError as error:
             raise DriverError(f"cannot read the log {self.name!r}: {error}") from error
 
     def close(self) -> None:
-        """Do nothing: the file is unmapped with its last message."""
+        """Close the file; may be called twice."""
+        self._data.file.close()
 
     def entries(self) -> Entries:
         """Return the places of all messages, chunk by chunk."""
         # 1. The summary of a closed file.
         found, end, is_whole = [np.empty(0, ENTRY)], len(MAGIC), False
         summary_at, footer_at = self._summary()
-        for record in _records(self._data[:footer_at], summary_at) if summary_at else ():
+        for record in _records(self._data, summary_at) if summary_at else ():
             with suppress(RecordError):  # then the data has the definition
                 self._learn(record)
         # 2. The data. In a file that was not closed, its last chunk may be cut.
@@ -99,30 +120,35 @@ class McapFile(LogFile):
                 is_whole = end == summary_at
                 break
             if record.opcode == Opcode.ATTACHMENT:
-                self._attached.append(record.content)
+                self._attached.append(record.begin)
             elif record.opcode == Opcode.CHUNK:
                 try:
-                    found.append(self._scanned(self._chunk(record.begin), 0, record.begin, is_cut=is_cut))
+                    data = self._chunk(record.begin)
+                    found.append(self._scanned(_records(data, 0), len(data), record.begin, is_cut=is_cut))
                 except RecordError as error:
                     self.faults[record.begin] = f"the chunk at byte {record.begin}: {error}"
             else:
-                found.append(self._scanned(self._data[: record.end], record.begin, _NO_CHUNK))
+                found.append(self._scanned([record], record.end, _NO_CHUNK))
         if not is_whole:
             used = ": used the data before" if any(map(len, found)) else ""
             self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {len(self._data)}{used}"
         return np.concatenate(found)
 
     def read(self, block: int, offset: int) -> memoryview:
-        """Return the bytes of the message of an entry."""
-        record = next(_records(self._data if block == _NO_CHUNK else self._chunk(block), offset))
+        """Return the bytes of the message of an entry; raise RecordError where they are gone."""
+        if block != _NO_CHUNK:
+            return next(_records(self._chunk(block), offset)).content[_MESSAGE.size :]
+        record = self._record(offset)
+        if len(record.content) != record.end - offset - _HEAD.size:
+            raise RecordError(f"the record at byte {offset}: it is not whole")
         return record.content[_MESSAGE.size :]
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments that are valid and within the limit."""
         found: dict[str, bytes] = {}
-        for content in self._attached:
+        for begin in self._attached:
             with suppress(RecordError):
-                if _CRC.size < len(content) <= MAX_ATTACHMENT_BYTES:
+                if _CRC.size < len(content := self._record(begin).content) <= MAX_ATTACHMENT_BYTES:
                     attachment, (crc,) = _parsed(Attachment, content), _CRC.unpack(content[-_CRC.size :])
                     if crc in (0, zlib.crc32(content[: -_CRC.size])):
                         found[attachment.name] = attachment.data
@@ -134,18 +160,24 @@ class McapFile(LogFile):
         The first one is 0 where the summary is not valid.
         """
         at = len(self._data) - _END.size
-        if at <= 0:
+        if at <= 0 or len(end := self._data[at:]) != _END.size:
             return 0, 0
-        opcode, size, start, crc, magic = _END.unpack_from(self._data, at)
+        opcode, size, start, crc, magic = _END.unpack(end)
         if (opcode, size, magic) != (Opcode.FOOTER, _END.size - _HEAD.size - len(MAGIC), MAGIC):
             return 0, 0
         start = start or at
         is_valid = start <= at and crc in (0, zlib.crc32(self._data[start : -len(MAGIC) - _CRC.size]))
         return start if is_valid else 0, at
 
+    def _record(self, begin: int) -> Record:
+        """Return a record of the file; raise RecordError where it is gone."""
+        if (record := next(_records(self._data, begin), None)) is None:
+            raise RecordError(f"the record at byte {begin}: it cannot be read")
+        return record
+
     def _unpacked(self, begin: int) -> memoryview:
         """Return the content of a chunk; raise RecordError where it is not the one that was written."""
-        record = next(_records(self._data, begin))
+        record = self._record(begin)
         try:
             size, crc, name_bytes = _CHUNK.unpack_from(record.content)
             at = _CHUNK.size + name_bytes + _SIZE.size
@@ -172,14 +204,14 @@ class McapFile(LogFile):
             raise RecordError("its content does not match its size and CRC")
         return data
 
-    def _scanned(self, source: memoryview, begin: int, block: int, *, is_cut: bool = False) -> Entries:
+    def _scanned(self, records: Iterable[Record], size: int, block: int, *, is_cut: bool = False) -> Entries:
         """Return the entries of the messages among records, and learn what the others define.
 
-        is_cut: the last one need not be whole.
+        size: where the last one ends. is_cut: the last one need not be whole.
         """
-        found, at = [], begin
-        for record in _records(source, begin):
-            if record.end > len(source):
+        found, at = [], 0
+        for record in records:
+            if record.end > size:
                 break
             at = record.end
             try:
@@ -193,7 +225,7 @@ class McapFile(LogFile):
                 found.append((channel, min(time_ns, LATEST_NS), header_ns, block, record.begin))
             except RecordError as error:
                 self.faults.setdefault(block or record.begin, f"the record at byte {record.begin}: {error}")
-        if at != len(source) and not is_cut:
+        if at != size and not is_cut:
             self.faults.setdefault(block, f"the chunk at byte {block}: its last record is not whole")
         return np.array(found, ENTRY)
 
