@@ -19,7 +19,7 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES
-from omnid.diagnostics.run_summary import RunCounters, RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import Synchronise
@@ -178,24 +178,6 @@ def stage_stats(stage: StageStats, rate_hz: float = math.nan) -> Stats:
     lost = Key.MISSED if stage.is_ticker else Key.DROPPED
     counts = {Key.RATE_HZ: rate_hz, Key.PROCESSED: stage.processed, lost: stage.dropped}
     return {**counts, **times(status_names.WORK, stage.wall)}
-
-
-def summary_stats(counters: RunCounters) -> Stats:
-    """Return the counters of a finished replay, one number a key."""
-    groups: dict[str, Stats] = {
-        "poses": counters.states,
-        "dropped": counters.drops,
-        "map": counters.map,
-        "places": counters.places,
-    }
-    return {
-        "pairs": counters.pairs,
-        "poses": counters.poses,
-        "length_m": f"{counters.length_m:.4f}",
-        Key.RESETS: counters.resets,
-        **{f"{group}_{name}": count for group, counts in groups.items() for name, count in counts.items()},
-        "_words": "the run has ended",
-    }
 
 
 RIG_WORDS = {

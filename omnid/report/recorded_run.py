@@ -190,7 +190,7 @@ class RecordedRun:
                 found.append(Event(t_s, t_s, (GOOD, WARNING, ERROR)[max(rank, 0)], "state", text))
         # 3. Messages and counters of all parts.
         for name in self.newest:
-            found += self._message_events(name) if name not in (status_names.ODOMETRY, status_names.SUMMARY) else ()
+            found += self._message_events(name) if name != status_names.ODOMETRY else ()
             found += self._counter_events(name)
         return sorted(found, key=lambda event: event.start_s)
 

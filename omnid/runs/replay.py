@@ -26,7 +26,7 @@ from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings, pair_loss
-from omnid.diagnostics.status import stage_stats, summary_stats
+from omnid.diagnostics.status import stage_stats
 from omnid.engine.graph import Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.process import RealtimeSettings
@@ -49,7 +49,7 @@ from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_t
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport.status_names import MOTION, SUMMARY, entry, stage_name
+from omnid.transport.status_names import MOTION, entry, stage_name
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
@@ -229,7 +229,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             statuses = [entry(stage_name(stage.name), stage_stats(stage)) for stage in graph.telemetry.stages]
             if front_end.pairing.motion.wheels or front_end.pairing.motion.gyro:
                 statuses.insert(0, entry(MOTION, front_end.motion_stats()))
-            statuses.insert(0, entry(SUMMARY, summary_stats(replace(counters, motor={}))))
             recorder.process(StatusReport(recorder.newest_ns, statuses))
             recorder.close()
 

@@ -42,7 +42,6 @@ FLOOR: Final = f"{PREFIX}floor"  # height of the cameras above it
 EXPOSURE: Final = f"{PREFIX}exposure"
 CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`
 SIMULATION: Final = f"{PREFIX}simulation"  # of a simulated robot whose time waits for the daemon
-SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
 STAGE_PREFIX: Final = f"{PREFIX}stage "
 
 STOPPED_PREFIX: Final = "stopped, "  # begins the keys that count stops of the wheels, by reason

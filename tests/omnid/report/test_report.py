@@ -29,7 +29,7 @@ from omnid.report.report import report_html
 from omnid.runs.session import attached_rig
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, Key, stage_name
+from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, WHEELS, Key, stage_name
 
 TERMINAL = "x\x1b[31m\x07\x9b2J"
 EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
@@ -79,7 +79,6 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
     parts = (
         DiagnosticStatus(EVIL, 2, EVIL, {EVIL: EVIL, "drops": "1"}),
         DiagnosticStatus(stage_name(EVIL), 1, EVIL, stage),
-        DiagnosticStatus(SUMMARY, 0, EVIL, {EVIL: EVIL}),
         DiagnosticStatus(TERMINAL, 1, TERMINAL, {}),
         DiagnosticStatus(ODOMETRY, 0, EVIL, odometry),
     )
