@@ -17,7 +17,6 @@ from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.open_log import open_log
 from drivers.logs.streams import (
-    LoggedImages,
     MotionTopics,
     TimeSource,
     choose_motion_topics,
@@ -153,14 +152,17 @@ class LogReader:
             self._report(warnings, self._motion - used)
 
     @cached_property
-    def _order(self) -> _Order:
-        """The messages of the cameras, the wheels and the IMU, in the order of their stamps."""
+    def _order(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], list[str]]:
+        """The messages of the cameras, the wheels and the IMU, in the order of their stamps.
+
+        Rows of the log (N,), stamps [ns] (N,), whether each is an image (N,), and warnings about the stamps.
+        """
         log = self._log
         rows = log.rows({*self.topics.values(), *self._motion})
         entries, names = log.entries[rows], [*log.topics]
         of_camera = {camera: log.topic[rows] == names.index(self.topics[camera]) for camera in CAMERAS}
         header_ns, log_ns = entries["header_ns"], entries["time_ns"]
-        images = {camera: LoggedImages(header_ns[of_it], log_ns[of_it]) for camera, of_it in of_camera.items()}
+        images = {camera: (header_ns[of_it], log_ns[of_it]) for camera, of_it in of_camera.items()}
         try:
             rule = stamp_rule(images, self._time)
         except DriverError as error:
@@ -169,7 +171,7 @@ class LogReader:
         # Of one stamp samples come first, then the lower camera, then the upper one.
         rank = of_camera["lower"] + 2 * of_camera["upper"]
         order = np.lexsort((rank, stamps_ns))
-        return _Order(rows[order], stamps_ns[order], rank[order] > 0, rule.warnings)
+        return rows[order], stamps_ns[order], rank[order] > 0, rule.warnings
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -211,12 +213,3 @@ class LogReader:
             for topic in sorted(unused)
             if self._log.counts()[topic]
         ]
-
-
-class _Order(NamedTuple):
-    """The N messages that are read, in the order of their stamps."""
-
-    rows: NDArray[np.int64]  # (N,) of the log
-    stamps_ns: NDArray[np.int64]  # (N,)
-    is_image: NDArray[np.bool_]  # (N,)
-    warnings: list[str]  # about the stamps

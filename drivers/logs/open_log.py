@@ -26,7 +26,6 @@ LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 _NAME: Final = re.compile(
     r"(?P<name>.+?)(?:_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?(?P<format>\.(?:mcap|db3|bag))(?:\.part)?"
 )
-_LISTED_FILES: Final = re.compile(r"^ *- ['\"]?(?:.*/)?(\S+?\.(?:mcap|db3))(?:\.zstd)?['\"]?$", re.M)  # of rosbag2
 _FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
     MCAP_MAGIC: McapFile,
     SQLITE_MAGIC: SqliteBag,
@@ -51,7 +50,6 @@ def open_log(path: str | os.PathLike[str], rate_hz: float = 0.0) -> Log:
         try:
             logs = logs_in(given)
             parts, missing = parts_in_order(logs)
-            missing = missing or _unlisted(given, logs)
             folders = [] if logs else image_folders(given)
         except OSError as error:
             raise DriverError(f"cannot read the folder {str(given)!r}: {error.strerror}") from error
@@ -117,11 +115,3 @@ def parts_in_order(logs: list[Path]) -> tuple[list[Path], list[str]]:
     ((name, suffix),) = names
     gaps = [f"{name}_{number}{suffix}" for number in range(numbers[0], numbers[-1]) if number not in found]
     return [found[number] for number in numbers], gaps
-
-
-def _unlisted(folder: Path, logs: list[Path]) -> list[str]:
-    """Return the parts of a log that metadata.yaml of rosbag2 lists, and that are not there."""
-    metadata = folder / "metadata.yaml"
-    text = metadata.read_text("utf-8", "replace") if metadata.is_file() else ""
-    there = {log.name for log in logs}
-    return [name for name in dict.fromkeys(_LISTED_FILES.findall(text)) if name not in there]

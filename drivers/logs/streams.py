@@ -1,7 +1,7 @@
 """Which topics of a log are the cameras, the wheels and the IMU, and by which of its two times a message is stamped.
 
 A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. The header is
-the better one, and is used unless it is not set. Headers that do not advance or run back are refused: `log.time` says
+the better one, and is used unless it is not set. Headers that run back are refused: `log.time` says
 which time is used. In a file the images of a camera are in the
 order of their headers, but for late ones, which fill a hole between others. Where a clock was set back, images lie
 beside others instead, or far behind.
@@ -29,10 +29,8 @@ _WORDS: dict[str, Camera] = {
     **dict.fromkeys(("upper", "top", "up"), CAMERAS[1]),
 }
 _COMPRESSED = "/compressed"  # ends the names of compressed images (image_transport)
-_SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as stamps that hardly advance say.
 _STEP_NS: Final = 500_000_000  # An image is logged by less behind a later one, unless a clock is set.
-_FASTEST: Final = 3.0  # Clocks and images run at rates that differ by less than this factor.
-_FEW: Final = 0.1  # Up to this share of headers may be unset or repeat the one before.
+_FEW: Final = 0.1  # Up to this share of headers may be unset.
 
 
 def choose_topics(log: str, topics: Mapping[str, str], wanted: Mapping[Camera, str | None]) -> dict[Camera, str]:
@@ -100,13 +98,6 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     return chosen, warnings
 
 
-class LoggedImages(NamedTuple):
-    """The N images of a camera in the order of the file."""
-
-    header_ns: Times  # stamps of the headers, 0 where unset
-    log_ns: Times
-
-
 class StampRule(NamedTuple):
     """By which time the messages of a log are stamped."""
 
@@ -119,76 +110,50 @@ class StampRule(NamedTuple):
         return np.where(self.by_header & (header_ns > 0), header_ns, log_ns + self.delay_ns)
 
 
-def stamp_rule(images: Mapping[Camera, LoggedImages], source: TimeSource = "auto") -> StampRule:
+def stamp_rule(images: Mapping[Camera, tuple[Times, Times]], source: TimeSource = "auto") -> StampRule:
     """Return how the messages of a log are stamped, by the images of both cameras.
 
-    Raise DriverError, by "auto", where the headers cannot be the times at which a camera took its images.
+    images: stamps of the headers, 0 where unset, and times of logging, in the order of the file. Raise DriverError, by
+    "auto", where the times run back.
     """
     # 1. Headers that are not set.
     both, is_auto, warnings = [images[camera] for camera in CAMERAS], source == "auto", list[str]()
-    unset = [int(np.count_nonzero((each.header_ns == 0) & (each.log_ns != 0))) for each in both]
-    is_unset = any(count > max(1, _FEW * len(each.header_ns)) for count, each in zip(unset, both, strict=True))
+    unset = [int(np.count_nonzero((header_ns == 0) & (log_ns != 0))) for header_ns, log_ns in both]
+    is_unset = any(count > max(1, _FEW * len(header_ns)) for count, (header_ns, _) in zip(unset, both, strict=True))
     by_header = source == "header" or (is_auto and not is_unset)
-    used = sum(unset) if by_header else is_auto * sum(len(each.log_ns) for each in both)
+    used = sum(unset) if by_header else is_auto * sum(len(log_ns) for _, log_ns in both)
     if used:
         warnings.append(f"used the times of logging for {used} images: the stamps of their headers are 0")
-    # 2. Times that are wrong.
-    faults = [_fault(each.header_ns if by_header else each.log_ns, each.log_ns) for each in both if is_auto]
+    # 2. Times that run back.
+    faults = [_fault(header_ns if by_header else log_ns, log_ns) for header_ns, log_ns in both if is_auto]
     if fault := next(filter(None, faults), ""):
         times = "stamps of its images' headers" if by_header else "headers of its images are 0, the times of logging"
         raise DriverError(
             f"the {times} {fault}: expected those of one clock that runs on; cut the log there, or choose "
             'log.time = "log", the times of logging, or "header"'
         )
-    if not by_header:
-        return StampRule(False, 0, warnings)
-    # 3. Cameras whose clocks differ.
-    delays_ns, steps_ns = [_delay_ns(each) for each in both], [list(map(_step_ns, each)) for each in both]
-    apart_ns = abs(delays_ns[0] - delays_ns[1])
-    # Images are logged at about the rate of their headers, unlike by a conversion.
-    is_live = all(_FASTEST * min(steps) > max(steps) for steps in steps_ns)
-    if is_live and 2 * apart_ns >= min(header_step_ns for header_step_ns, _ in steps_ns):
-        line = (
-            f"the clocks of the cameras differ by {apart_ns * 1e-9:.3f} s, half a period or more: images of different "
-            'moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
-        )
-        if is_auto and apart_ns > _STEP_NS:
-            raise DriverError(line)
-        warnings.append(line)
-    return StampRule(True, delays_ns[0], warnings)
+    # 3. Where a header is unset, the time of logging with the usual delay counts.
+    header_ns, log_ns = both[0]
+    is_set = by_header & (header_ns > 0)
+    delay_ns = round(float(np.median((header_ns - log_ns)[is_set]))) if is_set.any() else 0
+    return StampRule(by_header, delay_ns, warnings)
 
 
 def _fault(times: Times, log_ns: Times) -> str:
-    """Return why times cannot be those at which a camera took its images; empty where they can.
+    """Return by how much times run back, as no camera's do; empty where they do not.
 
     The images are in the order of the file; a message that is there twice, logged at one time, counts once.
     """
     is_repeated = (np.diff(times, prepend=-1) == 0) & (np.diff(log_ns, prepend=-1) == 0)
     times = times[~is_repeated & (times > 0)]
-    if len(times) < 2:
-        return ""
-    is_equal, step_ns = np.diff(times, prepend=-1) == 0, _step_ns(times)
-    if np.count_nonzero(is_equal) > max(1, _FEW * len(times)):
-        return "do not advance"
-    if step_ns < _SHORTEST_STEP_NS:
-        return f"are {step_ns / 1000:g} us apart"
-    # An image behind the latest one must fill a hole: closer than half a period to others there is none.
-    times = times[~is_equal]
-    behind_ns = np.maximum.accumulate(times) - times
     order, place, counts = np.unique(times, return_inverse=True, return_counts=True)
-    gaps_ns = np.concatenate([[np.inf], np.diff(order), [np.inf]])
-    is_crowded = (np.minimum(gaps_ns[:-1], gaps_ns[1:]) <= step_ns / 2) | (counts > 1)
-    is_late = np.append(False, times[1:] <= np.maximum.accumulate(times)[:-1])
+    if len(order) < 2:
+        return ""
+    # An image behind the latest one must fill a hole: closer than half a period to others there is none.
+    behind_ns = np.maximum.accumulate(times) - times
+    steps_ns = np.diff(order)
+    gaps_ns = np.concatenate([[np.inf], steps_ns, [np.inf]])
+    is_crowded = (np.minimum(gaps_ns[:-1], gaps_ns[1:]) <= np.median(steps_ns) / 2) | (counts > 1)
+    is_late = np.append(False, times[1:] < np.maximum.accumulate(times)[:-1])
     wrong = np.flatnonzero((is_late & is_crowded[place]) | (behind_ns > _STEP_NS)).tolist()
     return f"run back by {behind_ns[wrong[0]] * 1e-9:.3f} s at image {wrong[0] + 1}" if wrong else ""
-
-
-def _delay_ns(images: LoggedImages) -> int:
-    """Return the usual header minus time of logging; 0 without headers."""
-    is_set = images.header_ns > 0
-    return round(float(np.median((images.header_ns - images.log_ns)[is_set]))) if is_set.any() else 0
-
-
-def _step_ns(times: Times) -> float:
-    """Return the usual step between times, in any order; 0 of fewer than two."""
-    return float(np.median(np.diff(np.sort(times)))) if len(times) > 1 else 0.0

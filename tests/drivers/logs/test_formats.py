@@ -179,27 +179,6 @@ def test_the_parts_of_a_split_log_are_read_as_one(tmp_path: Path, suffix: str) -
     assert f"are missing: bag_5.{suffix}: used the others" in reader.warnings[0]
 
 
-METADATA: Final = "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n{}\n  message_count: 24\n"
-
-
-@pytest.mark.parametrize("missing", [None, 2])
-@pytest.mark.parametrize("suffix", ["", ".zstd"])
-def test_parts_that_metadata_lists_but_are_not_there_are_named(
-    tmp_path: Path, missing: int | None, suffix: str
-) -> None:
-    """The parts may have been unpacked."""
-    entries = pairs(12)
-    names = [f"bag_{number}.mcap" for number in range(3)]
-    for number in {0, 1, 2} - {missing}:
-        write_log(tmp_path / f"bag_{number}.mcap", entries[8 * number :][:8])
-    (tmp_path / "metadata.yaml").write_text(METADATA.format("\n".join(f"    - {name}{suffix}" for name in names)))
-    found, reader = read(tmp_path)
-    assert len(found) == (24 if missing is None else 16)
-    lines = [] if missing is None else [f"are missing: {names[missing]}: used the others"]
-    assert len(reader.warnings) == len(lines) and all(line in reader.warnings[0] for line in lines)
-    assert open_log(tmp_path).state == ("whole" if missing is None else "cut or corrupt")
-
-
 def test_omnids_own_recordings_of_one_run_are_parts(tmp_path: Path) -> None:
     """The last one was cut; one that is being written, or was completed since, is not read, or not twice."""
     entries = pairs(6)
