@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from functools import partial
 from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
 
@@ -248,10 +248,10 @@ def print_entries(entries: Mapping[str, object]) -> None:
             print(f"{name:<12} {value}")
 
 
-def print_json(value: object, stream: TextIO | None = None) -> None:
+def print_json(value: object) -> None:
     """Print dataclasses, mappings, sequences and numbers; a number that is not finite becomes null."""
     text = msgspec.json.format(msgspec.json.encode(value, enc_hook=_of_json), indent=2).decode()
-    print(text, file=stream or sys.stdout)
+    print(text)
 
 
 def _of_json(value: object) -> object:

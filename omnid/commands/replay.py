@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -28,7 +27,6 @@ from omnid.config import Config, unused_settings
 from omnid.diagnostics.run_summary import Progress, run_summary, summary_line
 from omnid.errors import OmnidError
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.sinks.files import on_stdout
 
 
 @command(VERBOSE, QUIET, RIG, CAMERAS, RATE, MAP, SETTINGS, JSON)
@@ -103,19 +101,18 @@ def run(args: argparse.Namespace) -> int:
 def replay_and_print(log: Path, config: Config, options: ReplayOptions, args: argparse.Namespace) -> int:
     """Replay a log, print warnings on stderr and the summary on stdout, and return the exit code.
 
-    Where a file goes to stdout, the summary goes to stderr. args: --quiet, --verbose, and perhaps --json.
+    args: --quiet, --verbose, and perhaps --json.
     """
     result = run_log(log, config, options if args.quiet else replace(options, progress=Progress()))
     for warning in result.warnings:
         warn(warning)
-    stream = sys.stderr if on_stdout(options.files) else sys.stdout
     if getattr(args, "json", False):
         found = {name: getattr(result, name) for name in ("counters", "warnings", "signal", "elapsed_s")}
-        print_json(found | {"timings": {stage: row._asdict() for stage, row in result.timings.items()}}, stream)
+        print_json(found | {"timings": {stage: row._asdict() for stage, row in result.timings.items()}})
     else:
-        print(run_summary(result.counters, result.timings.values(), verbose=args.verbose), file=stream)
+        print(run_summary(result.counters, result.timings.values(), verbose=args.verbose))
         speed = f"{result.counters.pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
-        print(summary_line("speed", speed), file=stream)
+        print(summary_line("speed", speed))
         if files := [path for _, path in options.files] + ([result.map_file] if result.map_file else []):
-            print(summary_line("written", ", ".join(map(str, files))), file=stream)
+            print(summary_line("written", ", ".join(map(str, files))))
     return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))

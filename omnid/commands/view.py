@@ -27,7 +27,7 @@ from omnid.plain_text import plain
 from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
-from omnid.sinks.files import check_outputs, on_stdout
+from omnid.sinks.files import check_outputs
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 if TYPE_CHECKING:  # it imports rerun, which may be missing
@@ -158,7 +158,6 @@ def report(args: argparse.Namespace) -> int:
     recorded = RecordedRun(args.log, args.topic)
     html = report_html(recorded, truth)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
-    output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
     line = f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"
-    print(plain(line), file=output)
+    print(plain(line))
     return 0

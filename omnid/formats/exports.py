@@ -6,7 +6,7 @@ PGM image and a YAML file that describes it.
 
 from __future__ import annotations
 
-import re
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,7 +33,6 @@ end_header
 """
 _WHITE, _BLACK, _GREY = 254, 0, 205  # free, occupied and unknown, as map_saver writes them
 # With nav2's default of 0.25, grey (255 - 205) / 255 = 0.196 would count as free.
-_PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*\.pgm")
 _YAML = """image: {image}
 mode: trinary
 resolution: {cell_m:.6g}
@@ -80,22 +79,12 @@ def write_grid(path: Path, grid: Grid) -> None:
         raise OmnidError(f"{path}: expected a name that ends in .yaml; the image gets the same name with .pgm")
     pixels = path.with_suffix(".pgm")
     x, y = grid.corner
-    text = _YAML.format(image=_quoted(pixels.name), cell_m=grid.cell_m, x=x, y=y)
-    try:
-        described = text.encode()
-    except UnicodeEncodeError:
-        raise OmnidError(
-            f"{path}: this name is no UTF-8, so the file cannot name its image: give another name"
-        ) from None
+    # A string of JSON is one of YAML.
+    text = _YAML.format(image=json.dumps(pixels.name), cell_m=grid.cell_m, x=x, y=y)
     image = np.select([grid.cells == FREE, grid.cells == OCCUPIED], [_WHITE, _BLACK], _GREY).astype(np.uint8)
     height, width = image.shape
     # Both are on the disk before one takes its name: an image next to the text of another map would be shifted.
     with replaced(pixels, "map") as new_image, replaced(path, "map") as new_text:
         # The first row is the highest y.
         new_image.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + image[::-1].tobytes())
-        new_text.write_bytes(described)
-
-
-def _quoted(name: str) -> str:
-    """Return a name as a YAML string."""
-    return name if _PLAIN.fullmatch(name) else "'" + name.replace("'", "''") + "'"
+        new_text.write_text(text)

@@ -46,13 +46,12 @@ from omnid.runs.systemd import Service, notify, period_s
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import PlannerDrive
-from omnid.sinks.encoder import StatusReport
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.obstacles import ADVICE, controller_scan
 from omnid.transport import status_names as names
 from omnid.transport import topics
 from omnid.transport.bus import Bus
-from omnid.transport.codec import compile_serialisers
+from omnid.transport.codec import Diagnostics, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness
 from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.topics import Answer, Request
@@ -306,7 +305,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
     )
 
     def give_status() -> None:
-        reports.push(StatusReport(clock.monotonic_ns(), collect()))
+        reports.push(Diagnostics(clock.monotonic_ns(), tuple(collect())))
 
     session.every(config.live.status_s, give_status, "status")
     return run_places

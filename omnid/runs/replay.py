@@ -44,11 +44,12 @@ from omnid.runs.wiring import Inputs, Outputs, WiredStages, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
-from omnid.sinks.encoder import Outgoing, StatusReport
+from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.tracking_state import MapState, TrackingState
+from omnid.transport.codec import Diagnostics
 from omnid.transport.status_names import MOTION, entry, stage_name
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
@@ -229,7 +230,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             statuses = [entry(stage_name(stage.name), stage_stats(stage)) for stage in graph.telemetry.stages]
             if front_end.pairing.motion.wheels or front_end.pairing.motion.gyro:
                 statuses.insert(0, entry(MOTION, front_end.motion_stats()))
-            recorder.process(StatusReport(recorder.newest_ns, statuses))
+            recorder.process(Diagnostics(recorder.newest_ns, tuple(statuses)))
             recorder.close()
 
         # 5. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.

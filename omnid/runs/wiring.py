@@ -19,12 +19,13 @@ from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan,
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from omnid.sinks.drive import LiveDrive, LockstepDrive
-from omnid.sinks.encoder import Outgoing, StatusReport
+from omnid.sinks.encoder import Outgoing
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.mapping import MapGrid, Mapping
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
+from omnid.transport.codec import Diagnostics
 from omnid.transport.topics import Answer
 
 BUS, FILES, BACKGROUND = "bus", "files", "background"  # threads that several stages and sinks share
@@ -64,7 +65,7 @@ class Outputs:
     bus: Output[Outgoing] | None = None  # takes all messages that leave the run
     recorder: Output[Any] | None = None  # takes them as well
     records_images: bool = False  # the recorder of a live run takes the images, too
-    reports: Stream[StatusReport] | None = None  # for bus and recorder
+    reports: Stream[Diagnostics] | None = None  # for bus and recorder
 
 
 class WiredStages(NamedTuple):

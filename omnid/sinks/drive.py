@@ -27,12 +27,11 @@ from omnid.core.frames import of_base
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, OdometryUpdate
-from omnid.navigation_state import NavigationState
 from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
-GRANTED: Final = {
+GRANTED: Final = {  # what the robot does after a request that it has accepted; else its state
     "goal": "it drives to the goal",
     "path": "it drives along the path",
     "resume": "it goes on",
@@ -73,17 +72,10 @@ class PlannerDrive:
         if update.setpoint is not None:
             self._link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
         for answer in update.answers:
-            words = answer.refusal or granted_words(answer.request, update.state, update.reason)
+            verb, _, name = answer.request.partition(" ")
+            state = f"{update.state}: {update.reason}" if update.reason else str(update.state)
+            words = answer.refusal or GRANTED.get(verb, state).format(name)
             self._answer(answer.id, Answer(not answer.refusal, words))
-
-
-def granted_words(request: str, state: NavigationState, reason: str = "") -> str:
-    """Return what the robot does after a request, in a word, that it has accepted.
-
-    state, reason: of the navigation after it.
-    """
-    verb, _, name = request.partition(" ")
-    return GRANTED.get(verb, f"{state}: {reason}" if reason else str(state)).format(name)
 
 
 class ReplayDrive:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,18 +18,10 @@ from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
-from omnid.transport.codec import DiagnosticStatus, PoseAttachment
+from omnid.transport.codec import Diagnostics, DiagnosticStatus, PoseAttachment
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry
 from omnid.transport.topics import MAP_POSE, PUBLISHED, SCAN
-
-
-class StatusReport(NamedTuple):
-    """The entries of all parts of a run, or of some."""
-
-    stamp_ns: int
-    statuses: Sequence[DiagnosticStatus]
-
 
 Outgoing: TypeAlias = (
     OdometryUpdate
@@ -39,7 +31,7 @@ Outgoing: TypeAlias = (
     | GridUpdate
     | ObstacleScan
     | NavigationUpdate
-    | StatusReport
+    | Diagnostics
 )
 
 
@@ -51,17 +43,13 @@ def same_time(stamp_ns: int) -> int:
     return stamp_ns
 
 
-class OutgoingMessage(NamedTuple):
-    """An encoded message; a topic without a leading '/' is below the robot's name."""
-
-    topic: str
-    schema: str
-    payload: bytes
+# Topic, ROS type and bytes of an encoded message; a topic without a leading '/' is below the robot's name.
+OutgoingMessage: TypeAlias = tuple[str, str, bytes]
 
 
 def _on(topic: str, payload: bytes) -> OutgoingMessage:
     """Return a message on one of the topics that are published."""
-    return OutgoingMessage(topic, PUBLISHED[topic].schema, payload)
+    return topic, PUBLISHED[topic].schema, payload
 
 
 class Encoder:
@@ -115,7 +103,7 @@ class Encoder:
             case GridUpdate():
                 grid = message.grid
                 yield _on("map", codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner))
-            case StatusReport():
+            case Diagnostics():
                 yield _on("status", codec.diagnostics_cdr(stamp_ns, message.statuses))
             case NavigationUpdate():
                 status = entry(NAVIGATION, navigation_stats(message))

@@ -41,14 +41,6 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             raise OmnidError(f"{option} {path}: {wrong}; name another file")
 
 
-def on_stdout(outputs: Named) -> bool:
-    """True if one of the outputs is the standard output, so that no other text may be printed there."""
-    with suppress(OSError):
-        found = os.fstat(1)
-        return any(path.exists() and os.path.samestat(path.stat(), found) for _, path in outputs)
-    return False
-
-
 def _identity(path: Path) -> tuple[int, int] | str:
     """Return a key that is the same for all names of a file, hard and symbolic links included."""
     with suppress(OSError):
@@ -86,7 +78,6 @@ class TrajectoryFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: FileIO | None = None
-        self._whole_bytes = 0
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Write the row of a pose T_odom_rig."""
@@ -97,9 +88,7 @@ class TrajectoryFile:
         try:
             row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
             if self.opened().write(row) != len(row):
-                self.opened().truncate(self._whole_bytes)  # remove the part of a row
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            self._whole_bytes += len(row)
         except OSError as error:
             raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error
 

@@ -136,7 +136,7 @@ class Recorder:
             if isinstance(message, Frame):
                 for frame in self._thinned.take(message):
                     frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
-                    self._write([OutgoingMessage(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
+                    self._write([(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
             elif encode is not None:
                 self._write(encode(message), stamp_ns)
             self.newest_ns = max(self.newest_ns, stamp_ns)

@@ -22,8 +22,8 @@ from omnid.core.types.panorama import PaddedPanorama
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import MapUpdate, OdometryUpdate, Panoramas, StereoDepth
 from omnid.runs.record import open_recorder
-from omnid.sinks.encoder import Encoder, StatusReport
-from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.sinks.encoder import Encoder
+from omnid.transport.codec import ERROR, OK, Diagnostics, DiagnosticStatus
 from omnid.transport.status_names import RECORDING, entry
 from tests.drivers.logs.mcap_logs import jpeg
 from tests.set_clock import SetClock
@@ -110,7 +110,7 @@ def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
         recorder.process(VelocityCommand(5 * 10**9 + n, 0.1, math.nan, 0.2))
-    recorder.process(StatusReport(5 * 10**9, [DiagnosticStatus("omnid: test", 0, "fine", {})]))
+    recorder.process(Diagnostics(5 * 10**9, (DiagnosticStatus("omnid: test", 0, "fine", {}),)))
     recorder.process(MapUpdate(0, 5 * 10**9, points, np.zeros((0, 2))))
     recorder.close()
     (path,) = recorded(tmp_path / "log")
@@ -158,7 +158,7 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
         for camera in ("lower", "upper"):
             recorder.process(replace(frame(n, camera), stamp_ns=stamp_ns))
         computer.advance(0.1)
-        recorder.process(StatusReport(stamp_ns, [DiagnosticStatus("omnid: test", 0, "fine", {})]))
+        recorder.process(Diagnostics(stamp_ns, (DiagnosticStatus("omnid: test", 0, "fine", {}),)))
         if n in (9, 19):
             computer.set_forwards(step_s)
         recorder.process(replace(odometry(n), stamp_ns=stamp_ns))  # of images of before the step, later than it
