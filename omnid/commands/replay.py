@@ -24,7 +24,7 @@ from omnid.commands.options import (
     warn,
 )
 from omnid.config import Config, unused_settings
-from omnid.diagnostics.run_summary import Progress, run_summary, summary_line
+from omnid.diagnostics.run_summary import Progress, run_summary, summary_entries
 from omnid.errors import OmnidError
 from omnid.runs.replay import ReplayOptions, run_log
 
@@ -110,9 +110,10 @@ def replay_and_print(log: Path, config: Config, options: ReplayOptions, args: ar
         found = {name: getattr(result, name) for name in ("counters", "warnings", "signal", "elapsed_s")}
         print_json(found | {"timings": {stage: row._asdict() for stage, row in result.timings.items()}})
     else:
-        print(run_summary(result.counters, result.timings.values(), verbose=args.verbose))
-        speed = f"{result.counters.pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
-        print(summary_line("speed", speed))
+        entries = summary_entries(result.counters, verbose=args.verbose)
+        pairs_hz = result.counters.pairs / max(1e-3, result.elapsed_s)
+        entries["speed"] = f"{pairs_hz:.1f} pairs/s, in {result.elapsed_s:.1f} s"
         if files := [path for _, path in options.files] + ([result.map_file] if result.map_file else []):
-            print(summary_line("written", ", ".join(map(str, files))))
+            entries["written"] = ", ".join(map(str, files))
+        print(run_summary(entries, result.timings.values() if args.verbose else ()))
     return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))

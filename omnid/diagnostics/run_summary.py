@@ -110,21 +110,16 @@ def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str
     return {name: text for name, text in found.items() if text or name == "states"}
 
 
-def run_summary(counters: RunCounters, timings: Iterable[SummaryRow], *, verbose: bool = False) -> str:
-    """Return the counters, one a line. verbose: all, with a row for each stage that processed messages."""
-    lines = []
-    if verbose:
-        lines = [f"{'stage':<17}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"]
-        lines += [
-            f"{r.stage:<17}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in timings if r.n
-        ]
-        lines.append("")
-    return "\n".join([*lines, *(summary_line(*one) for one in summary_entries(counters, verbose=verbose).items())])
-
-
-def summary_line(name: str, text: str) -> str:
-    """Return an entry of the summary as a line."""
-    return f"{name:<9} {text}"
+def run_summary(entries: Mapping[str, str], timings: Iterable[SummaryRow] = ()) -> str:
+    """Return texts by name, one a line, after a row for each stage of the timings that processed messages."""
+    lines = [f"{name:<9} {text}" for name, text in entries.items()]
+    rows = [
+        f"{r.stage:<17}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in timings if r.n
+    ]
+    if not rows:
+        return "\n".join(lines)
+    head = f"{'stage':<17}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"
+    return "\n".join([head, *rows, "", *lines])
 
 
 class Progress:
