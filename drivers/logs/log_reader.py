@@ -6,6 +6,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
@@ -44,9 +45,23 @@ class LogCameras(NamedTuple):
     rate_hz: float = 0.0
     time: TimeSource = "auto"
 
-    def reader(self, path: str | os.PathLike[str]) -> LogReader:
-        """Open a log."""
-        return LogReader(path, self.lower, self.upper, bits=self.bits, rate_hz=self.rate_hz, time=self.time)
+    def reader(
+        self,
+        path: str | os.PathLike[str],
+        rig_topics: tuple[str, str] = ("", ""),
+        span_s: tuple[float, float] = WHOLE,
+        motion: MotionTopics | None = None,
+    ) -> LogReader:
+        """Open a log; rig_topics: those that a rig states, which count where none are named and the log has them."""
+        bits, rate_hz, time = self.bits, self.rate_hz, self.time
+
+        def opened(lower: str | None, upper: str | None) -> LogReader:
+            return LogReader(path, lower, upper, span_s=span_s, motion=motion, bits=bits, rate_hz=rate_hz, time=time)
+
+        if not (self.lower and self.upper) and all(rig_topics):
+            with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
+                return opened(self.lower or rig_topics[0], self.upper or rig_topics[1])
+        return opened(self.lower, self.upper)
 
 
 # Both topics, or more.

@@ -16,7 +16,6 @@ from calib.fit.rig_from_drive import DriveObservations, DriveState
 from calib.rig import Rig
 from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogCameras, LogReader
-from omnid.calibration.images import open_log
 from omnid.config import Config
 from omnid.core.rig.column_finding import RigState, match
 from omnid.core.rig.drive_landmarks import DriveLandmarks, PanoramaObservations, View, image_pixels
@@ -109,7 +108,7 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     landmarks = DriveLandmarks(place.model(NOISE_PX))
     T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
     since = 0
-    with closing(open_log(log, cameras, place.rig)) as reader:
+    with closing(cameras.reader(log, place.rig.topics)) as reader:
         # Least number of pairs between two keyframes, so that there are `most` at most.
         apart = max(1, -(-(reader.pair_estimate() or 0) // most))
         for update in tracked_updates(reader, front_end, config, log):

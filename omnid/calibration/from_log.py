@@ -24,7 +24,6 @@ from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts
-from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator
@@ -150,7 +149,7 @@ def calibrate_mask(
     cameras = LogCameras(*topics)
     place = geometry(with_masks(log, rig, cameras), config.panorama)
     front_end, parts = FrontEnd(place, config), FixedParts(place.cylinder)
-    with closing(open_log(log, cameras, rig)) as reader:
+    with closing(cameras.reader(log, rig.topics)) as reader:
         for update in tracked_updates(reader, front_end, config, log):
             pair = update.depth.panoramas
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:

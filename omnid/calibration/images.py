@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig import Rig
-from drivers.errors import DriverError, FrameDecodeError
+from drivers.errors import FrameDecodeError
 from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES, image_folders
 from drivers.logs.log_reader import LogCameras, LogReader
@@ -165,15 +164,6 @@ def _paired(frames: Iterator[Frame], tolerance_ns: float) -> Iterator[tuple[Fram
             waiting = None
         else:
             waiting = frame
-
-
-def open_log(log: Path, cameras: LogCameras, rig: Rig | None) -> LogReader:
-    """Open the log's two cameras: by the requested topics, by the rig's if the log has them, or by their names."""
-    if rig and not (cameras.lower or cameras.upper):
-        lower, upper = rig.topics
-        with suppress(DriverError):
-            return cameras._replace(lower=lower or None, upper=upper or None).reader(log)
-    return cameras.reader(log)
 
 
 def brightest(images: Iterable[Image]) -> Image:

@@ -13,7 +13,7 @@ import numpy as np
 from calib.fit.rig_drift import apply_drift
 from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras
-from omnid.calibration.images import TOLERANCE_NS, open_log, spread_pairs
+from omnid.calibration.images import TOLERANCE_NS, spread_pairs
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import (
     DRIFTED_PX,
@@ -122,7 +122,7 @@ def read_rig_pairs(log: Path, rig: Rig, cameras: LogCameras) -> list[FramePair]:
     Cameras that are not synchronised are paired as in a run: within half a period.
     """
     decode, found = Decoder(rig), list[FramePair]()
-    with closing(open_log(log, cameras, rig)) as reader:
+    with closing(cameras.reader(log, rig.topics)) as reader:
         lower_ns = [frame.stamp_ns for frame in reader.frames() if frame.camera == "lower"]
         period_ns = float(np.median(np.diff(lower_ns))) if len(lower_ns) > 1 else 0.0
         for number, *frames in spread_pairs(reader, PAIRS, max(TOLERANCE_NS, period_ns / 2)):
@@ -150,5 +150,5 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
 
 def with_masks(log: Path, rig: Rig, cameras: LogCameras) -> Rig:
     """Return the rig with the masks of its mirrors, found in the images of a log where the rig has none."""
-    with closing(open_log(log, cameras, rig)) as reader:
+    with closing(cameras.reader(log, rig.topics)) as reader:
         return with_rims(rig, reader.frames())

@@ -25,7 +25,7 @@ from drivers.logs.log_reader import LogCameras
 from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
-from omnid.calibration.images import SIDES, open_log, read_pairs
+from omnid.calibration.images import SIDES, read_pairs
 from omnid.calibration.live_boards import LiveBoards, newest_pairs, status
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.rig_check import check_log, with_upper_corrected
@@ -202,7 +202,7 @@ def drive(args: argparse.Namespace) -> int:
     if args.rig is not None:
         start = read_rig(args.rig)
     else:
-        with closing(open_log(args.logs[0], log_cameras(args), None)) as reader:
+        with closing(log_cameras(args).reader(args.logs[0])) as reader:
             start = attached_rig(reader, args.logs[0])
     prepare_kernels()
     # 2. Check the rig, or adjust all of it.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
-from drivers.errors import DriverError
 from drivers.frame import Frame
-from drivers.logs.log_reader import WHOLE, LogReader
+from drivers.logs.log_reader import WHOLE, LogCameras, LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE
@@ -265,20 +264,8 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
 
 def _opened(log: Path, config: Config, options: ReplayOptions, rig: Rig | None) -> LogReader:
     """Open the log; the topics are those of the options, else of the rig, else found by their names."""
-    lower, upper = options.topics
-    open_log = partial(
-        LogReader,
-        log,
-        span_s=options.span_s,
-        motion=motion_topics(config),
-        bits=config.cameras.bits,
-        rate_hz=config.log.rate_hz,
-        time=config.log.time,
-    )
-    if rig and not (lower and upper) and all(rig.topics):
-        with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
-            return open_log(lower or rig.topics[0], upper or rig.topics[1])
-    return open_log(lower, upper)
+    cameras = LogCameras(*options.topics, config.cameras.bits, config.log.rate_hz, config.log.time)
+    return cameras.reader(log, rig.topics if rig else ("", ""), options.span_s, motion_topics(config))
 
 
 def _paced(reader: LogReader, graph: Graph, front_end: FrontEnd) -> Callable[[], Iterator[Frame]]:
