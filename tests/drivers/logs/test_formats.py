@@ -251,6 +251,18 @@ def test_a_truncated_log_gives_the_frames_before(tmp_path: Path, step: int, name
     assert counts == sorted(counts, reverse=True) and set(counts) >= {0, 2, 4}
 
 
+@pytest.mark.parametrize("name", ["mcap", "mcap without chunks"])
+def test_a_log_that_is_truncated_while_it_is_read_gives_the_frames_that_are_left(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path, pairs(PAIRS))
+    with closing(LogReader(path)) as reader:
+        frames = reader.frames()
+        first = next(frames)
+        os.truncate(path, path.stat().st_size // 2)
+        found = contents([first, *frames])
+        assert 2 < len(found) < 2 * PAIRS and found == expected(PAIRS)[: len(found)]
+        assert len(reader.warnings) == 1 and "corrupt chunks or records" in reader.warnings[0]
+
+
 @pytest.mark.parametrize("name", [*MCAP_LAYOUTS, "bag, bz2", "db3"])
 def test_flipped_bits_change_no_frame_of_a_chunk(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path, pairs(2))
