@@ -142,7 +142,7 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 def decoded(message: Outgoing, points: int = 10) -> list[tuple[str, Any]]:
     """Return topics and messages of ROS 2."""
     encode = Encoder(np.eye(4), points, unix_ns)
-    return [(sent.topic, STORE.deserialize_cdr(sent.payload, sent.schema)) for sent in encode(message)]
+    return [(topic, STORE.deserialize_cdr(payload, schema)) for topic, schema, payload in encode(message)]
 
 
 def test_a_cloud_has_the_most_confident_points_in_their_order() -> None:
@@ -156,13 +156,13 @@ def test_a_cloud_has_the_most_confident_points_in_their_order() -> None:
 
 def test_the_static_frames_lead_from_the_base_to_the_cameras() -> None:
     rig = replace(make_rig(size=256), T_base_rig=se3.exp([0.1, 0.0, 0.4, 0.0, 0.1, 0.5]))
-    sent = next(iter(Encoder(rig.T_base_rig, 1, unix_ns, rig)(odometry(0))))
+    topic, schema, payload = next(iter(Encoder(rig.T_base_rig, 1, unix_ns, rig)(odometry(0))))
     found = {}
-    for edge in cast("Any", STORE.deserialize_cdr(sent.payload, sent.schema)).transforms:
+    for edge in cast("Any", STORE.deserialize_cdr(payload, schema)).transforms:
         t, q = edge.transform.translation, edge.transform.rotation
         T = se3.transform(se3.rotation([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
         found[edge.header.frame_id, edge.child_frame_id] = T
-    assert sent.topic == "/tf_static"
+    assert topic == "/tf_static"
     assert list(found) == [("base_link", "rig"), ("rig", "lower"), ("rig", "upper")]
     np.testing.assert_allclose(found["base_link", "rig"], rig.T_base_rig, atol=1e-12)
     np.testing.assert_allclose(found["rig", "upper"] @ rig.upper.T_cam_rig, np.eye(4), atol=1e-9)
