@@ -29,6 +29,7 @@ _WORDS: dict[str, Camera] = {
     **dict.fromkeys(("upper", "top", "up"), CAMERAS[1]),
 }
 _COMPRESSED = "/compressed"  # ends the names of compressed images (image_transport)
+_SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second: these are stamps in microseconds.
 _STEP_NS: Final = 500_000_000  # An image is logged by less behind a later one, unless a clock is set.
 _FEW: Final = 0.1  # Up to this share of headers may be unset.
 
@@ -114,7 +115,7 @@ def stamp_rule(images: Mapping[Camera, tuple[Times, Times]], source: TimeSource 
     """Return how the messages of a log are stamped, by the images of both cameras.
 
     images: stamps of the headers, 0 where unset, and times of logging, in the order of the file. Raise DriverError, by
-    "auto", where the times run back.
+    "auto", where the times run back, or are too close to each other.
     """
     # 1. Headers that are not set.
     both, is_auto, warnings = [images[camera] for camera in CAMERAS], source == "auto", list[str]()
@@ -124,7 +125,7 @@ def stamp_rule(images: Mapping[Camera, tuple[Times, Times]], source: TimeSource 
     used = sum(unset) if by_header else is_auto * sum(len(log_ns) for _, log_ns in both)
     if used:
         warnings.append(f"used the times of logging for {used} images: the stamps of their headers are 0")
-    # 2. Times that run back.
+    # 2. Times that are wrong.
     faults = [_fault(header_ns if by_header else log_ns, log_ns) for header_ns, log_ns in both if is_auto]
     if fault := next(filter(None, faults), ""):
         times = "stamps of its images' headers" if by_header else "headers of its images are 0, the times of logging"
@@ -140,7 +141,7 @@ def stamp_rule(images: Mapping[Camera, tuple[Times, Times]], source: TimeSource 
 
 
 def _fault(times: Times, log_ns: Times) -> str:
-    """Return by how much times run back, as no camera's do; empty where they do not.
+    """Return why times cannot be those at which a camera took its images; empty where they can.
 
     The images are in the order of the file; a message that is there twice, logged at one time, counts once.
     """
@@ -152,8 +153,11 @@ def _fault(times: Times, log_ns: Times) -> str:
     # An image behind the latest one must fill a hole: closer than half a period to others there is none.
     behind_ns = np.maximum.accumulate(times) - times
     steps_ns = np.diff(order)
+    step_ns = np.median(steps_ns)
+    if step_ns < _SHORTEST_STEP_NS:
+        return f"are {step_ns / 1000:g} us apart"
     gaps_ns = np.concatenate([[np.inf], steps_ns, [np.inf]])
-    is_crowded = (np.minimum(gaps_ns[:-1], gaps_ns[1:]) <= np.median(steps_ns) / 2) | (counts > 1)
+    is_crowded = (np.minimum(gaps_ns[:-1], gaps_ns[1:]) <= step_ns / 2) | (counts > 1)
     is_late = np.append(False, times[1:] < np.maximum.accumulate(times)[:-1])
     wrong = np.flatnonzero((is_late & is_crowded[place]) | (behind_ns > _STEP_NS)).tolist()
     return f"run back by {behind_ns[wrong[0]] * 1e-9:.3f} s at image {wrong[0] + 1}" if wrong else ""

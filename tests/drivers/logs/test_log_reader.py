@@ -322,6 +322,7 @@ AS_TAKEN: Final = [
 ]
 # Stamps of headers -> part of the line that refuses them.
 WRONG: Final[dict[str, tuple[Times, str]]] = {
+    "microseconds for nanoseconds": (lambda topic, number, ns: ns // 1000, "headers are 100 us apart"),
     "one of the future": (lambda topic, number, ns: ns + 3600 * S * (number == HALF), "run back by 3599.9"),
     "a clock set back within a period": (back(0.13), "run back by 0.030 s at image 21"),
     "a clock set back by more than the log": (back(3600), "run back by 3599.9"),
