@@ -19,8 +19,8 @@ from calib.models.names import sees_directly, visible_part
 
 # Rotation [rad] and direction of the baseline [rad], in the rectified frame; length of the baseline [m].
 TRANSFORM_NAMES = ("r_x", "r_y", "r_z", "e_x", "e_y", "baseline")
-# Correlations are rounded, so that their text is exact; by the rounding an eigenvalue may be slightly negative.
-CORRELATION_DECIMALS, MIN_EIGENVALUE = 12, -1e-9
+# Correlations and translations [m] are rounded, so that their text is exact, by which an eigenvalue may be negative.
+DECIMALS, MIN_EIGENVALUE = 12, -1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class RigCovariance:
         """Return the covariance of a matrix (P, P) in the parameters' own units."""
         sigmas = np.sqrt(np.maximum(0.0, np.diag(matrix)))
         scale = np.where(sigmas > 0, sigmas, 1.0)
-        correlation = np.clip(matrix / np.outer(scale, scale), -1, 1).round(CORRELATION_DECIMALS)
+        correlation = np.clip(matrix / np.outer(scale, scale), -1, 1).round(DECIMALS)
         correlation = np.tril(correlation, -1) + np.tril(correlation, -1).T + np.eye(len(names))
         return RigCovariance(tuple(names), sigmas, correlation)
 
@@ -78,10 +78,9 @@ class RigCovariance:
 
 
 MIN_BASELINE_M = 1e-3  # Viewpoints that are closer would show no depth.
-MAX_BASELINE_M = 5.0  # of two cameras on one robot: a larger number has another unit
+MAX_LENGTH_M = 10.0  # of baseline and height of cameras on a robot: a larger number has another unit
 # A T_base_rig that puts the cameras on the floor states no height; the identity, used without a measurement, does so.
 LEAST_HEIGHT_M = 0.1
-MAX_HEIGHT_M = 10.0  # of cameras on a robot: a larger number has another unit
 # Larger numbers are refused: they are probably in ms and us.
 MAX_UPPER_DELAY_S, MAX_LINE_TIME_S = 1.0, 1e-3
 
@@ -142,9 +141,9 @@ class Rig:
         ):
             if not se3.is_rigid(T):
                 raise CalibError(f"rig: {name} must be a 4x4 rotation and translation, found {np.round(T, 4).tolist()}")
-        if not MIN_BASELINE_M <= self.baseline_m <= MAX_BASELINE_M:
+        if not MIN_BASELINE_M <= self.baseline_m <= MAX_LENGTH_M:
             raise CalibError(
-                f"rig: the viewpoints must lie apart, by {MAX_BASELINE_M:g} m at most, found "
+                f"rig: the viewpoints must lie apart, by {MAX_LENGTH_M:g} m at most, found "
                 f"{self.baseline_m * 1e3:.3f} mm; check that the transforms are T_cam_rig in metres"
             )
 
@@ -168,9 +167,9 @@ class Rig:
 
     def at_height(self, height_m: float) -> Rig:
         """Return the rig with its lower viewpoint at a height above the base's origin."""
-        if not LEAST_HEIGHT_M <= height_m <= MAX_HEIGHT_M:
+        if not LEAST_HEIGHT_M <= height_m <= MAX_LENGTH_M:
             raise CalibError(
-                f"height of the cameras: expected {LEAST_HEIGHT_M:g} to {MAX_HEIGHT_M:g} m from the floor "
+                f"height of the cameras: expected {LEAST_HEIGHT_M:g} to {MAX_LENGTH_M:g} m from the floor "
                 f"to the lower viewpoint, found {height_m:g}"
             )
         T_base_rig = self.T_base_rig.copy()

@@ -27,15 +27,13 @@ from calib.models.camera import Mask, OmniCamera
 from calib.models.names import MODELS, camera_of, is_coefficient, model_name, names_of, values_of
 from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
-from calib.rig import TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
+from calib.rig import DECIMALS, TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
 from calib.typed_toml import convert, shown, table_of
 from calib.validation import read_bytes, require_image_size, transform_of
 
-SCHEMA: Final = 1  # the first: it rises when an earlier program would misread the file
-COVARIANCE_VERSION: Final = 1  # the same for the table [covariance]
+# Version of the file and of its table [covariance]: it rises when an earlier program would misread them.
+SCHEMA: Final = 1
 SIDES: Final = ("lower", "upper")
-# Translations are rounded to 1e-12 m: two inversions round differently, and rounding makes the text reproducible.
-TRANSLATION_DECIMALS: Final = 12
 EMBEDDED: Final = "data:image/png;base64,"
 
 # 1. The tables of the file.
@@ -214,7 +212,7 @@ def _mask_image(source: str, size: Size, folder: Path | None) -> NDArray[np.uint
 
 def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
     """Return the covariance of the parameters of both cameras and of the transform between them."""
-    _require_version("covariance.version", table.version, COVARIANCE_VERSION)
+    _require_version("covariance.version", table.version, SCHEMA)
     known, names = {*TRANSFORM_NAMES}, table.parameters
     for side, camera in (("lower", rig.lower), ("upper", rig.upper)):
         known |= {f"{side} {name}" for name in names_of(camera.model)}
@@ -254,7 +252,8 @@ def rig_toml(rig: Rig) -> str:
         text += f"T_base_rig = {_value(rig.T_base_rig.tolist())}\n"
     for (side, mounted), topic in zip(rig.sides, rig.topics, strict=True):
         camera, T_rig_cam = mounted.camera, se3.inverse(mounted.T_cam_rig)
-        T_rig_cam[:3, 3] = np.round(T_rig_cam[:3, 3], TRANSLATION_DECIMALS)
+        # Two inversions round differently, and rounding makes the text reproducible.
+        T_rig_cam[:3, 3] = np.round(T_rig_cam[:3, 3], DECIMALS)
         head = {
             "model": model_name(camera),
             "size": [int(pixels) for pixels in camera.size],
@@ -274,7 +273,7 @@ def rig_toml(rig: Rig) -> str:
     if (covariance := rig.covariance) is not None:
         correlation = tuple(tuple(row[:k]) for k, row in enumerate(covariance.correlation.tolist()))
         sigmas = tuple(covariance.sigmas.tolist())
-        table = CovarianceTable(COVARIANCE_VERSION, covariance.names, sigmas, correlation)
+        table = CovarianceTable(SCHEMA, covariance.names, sigmas, correlation)
         text += _table_text("covariance", asdict(table))
     return text
 

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from calib.models.camera import Array, Mask
 
 AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would give the same
-MIN_SIDE_PX = 64  # Shorter side of the smallest image.
 # Least difference of grey levels between the middle and the corners; half of it across the edge at one azimuth.
 MIN_CONTRAST = 25.0
 # Threshold between the dark (0) and the light level (1), nearer the dark one, because the world at the rim is often
@@ -37,7 +36,7 @@ def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mas
     center_guess (u, v) [px] may be off by a tenth of the radius. An image that is bright on all sides (or the maximum
     of several) gives the best rim. None for dark or full-frame images, noise, soft vignettes.
     """
-    levels = _levels(image) if min(image.shape) >= MIN_SIDE_PX else None
+    levels = _levels(image)
     if levels is None:
         return None
     edges = _edges(image, center_guess, levels)
@@ -51,7 +50,7 @@ def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mas
 
 def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
     """Return the dark level, of the corners, and the light level, of the middle; None if they are too close."""
-    side = min(image.shape) // 16
+    side = max(1, min(image.shape) // 16)
     corners = [image[:side, :side], image[:side, -side:], image[-side:, :side], image[-side:, -side:]]
     middle = image[tuple(slice(size // 4, -size // 4) for size in image.shape)]
     dark, light = float(np.median([np.median(corner) for corner in corners])), float(np.median(middle))

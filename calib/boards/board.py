@@ -101,10 +101,7 @@ def ambiguous_orders(board: CalibrationBoard) -> list[NDArray[np.intp]]:
 
 
 MODE_NAMES = ("bend_x", "bend_y", "twist", "stretch")
-# One step of each mode: a millimetre of height, or a hundredth of the sides' ratio. Each is about a pixel of a near
-# board.
-MODE_UNITS = np.array([1e-3, 1e-3, 1e-3, 1e-2])
-# Standard deviations of the modes of usual prints, the prior of a fit [m, m, m, ratio].
+# Standard deviations of the modes of usual prints, the prior of a fit, and one step of each [m, m, m, ratio].
 MODE_SIGMAS = np.array([1e-3, 1e-3, 1e-3, 2e-3])
 
 
@@ -134,13 +131,13 @@ class PrintShape:
         """
         middle, half = _sides(drawn)
         uv = (places[:, :2] - middle) / half
-        moved = places + _moves(uv, half) @ (np.array(self.values) / MODE_UNITS)
+        moved = places + _moves(uv, half) @ (np.array(self.values) / MODE_SIGMAS)
         moved[:, :2] -= 2 / 3 * np.array(self.values[:2]) ** 2 * uv**3 / half
         return np.asarray(moved)
 
     def moved(self, steps: Array) -> PrintShape:
         """Return the shape after steps (4,) of its modes."""
-        bend_x, bend_y, twist, stretch = (np.array(self.values) + steps * MODE_UNITS).tolist()
+        bend_x, bend_y, twist, stretch = (np.array(self.values) + steps * MODE_SIGMAS).tolist()
         return PrintShape((bend_x, bend_y, twist, stretch))
 
     def described(self, drawn: Array) -> str:
@@ -175,4 +172,4 @@ def _moves(uv: Array, half: Array) -> Array:
     moves = np.zeros((len(uv), 3, len(MODE_NAMES)))
     moves[:, 2, :3] = np.column_stack([1 - uv**2, uv[:, :1] * uv[:, 1:]])
     moves[:, :2, 3] = uv * half * (-0.5, 0.5)
-    return np.asarray(moves * MODE_UNITS)
+    return np.asarray(moves * MODE_SIGMAS)

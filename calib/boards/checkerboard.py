@@ -24,7 +24,7 @@ from calib.boards.corner_candidates import (
     sample,
     smoothed,
 )
-from calib.boards.corner_grid import MIN_RING_PX, WINDOW_PART, Grid, find_grids, grow_grid, with_clockwise_axes
+from calib.boards.corner_grid import ALONG, MIN_RING_PX, WINDOW_PART, Grid, find_grids, grow_grid, with_clockwise_axes
 from calib.boards.local_mapping import (
     local_mapping,
     mapping_of_others,
@@ -40,8 +40,6 @@ MIN_SIDE_PX = 32
 TRIED_GRIDS = 5
 # Least score of a board: right ones in hard renderings have 0.5 to 0.75, others 0.3 at most.
 MIN_SCORE = 0.4
-# Sampling positions within a square, away from its edges.
-MIDDLE = np.linspace(0.3, 0.7, 5)
 
 
 def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = True) -> BoardView | None:
@@ -113,7 +111,7 @@ def _square_means(image: Grey, corners: Array, board: Board) -> Array:
     """
     points, known = board.points[:, :2] / board.square_m, np.isfinite(corners[:, 0])
     level = np.full((board.rows + 3, board.columns + 3), np.nan)
-    x, y = np.meshgrid(MIDDLE, MIDDLE)
+    x, y = np.meshgrid(ALONG, ALONG)
     for row, column in np.ndindex(level.shape):
         place = np.clip([column - 2, row - 2], 0, [board.columns - 1, board.rows - 1]).astype(float)
         mapping = local_mapping(place, points[known], corners[known], exact=True)
@@ -145,10 +143,8 @@ def _most_corners(board: Board) -> int:
 
 
 # Least share of known corners in the whole board, and in each of its four borders: a row that is missing belongs to a
-# board of another size.
+# board of another size. A row just outside with that share of corners belongs to a larger board.
 MIN_FILLED, MIN_BORDER = 0.8, 0.6
-# A row just outside with at least this share of corners belongs to a larger board.
-BEYOND = 0.7
 
 
 def grid_to_array(grid: Grid) -> Array:
@@ -176,7 +172,7 @@ def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
         borders = [inside[..., 0, :], inside[..., -1, :], inside[..., 0], inside[..., -1]]
         isolated = inside.mean(axis=(-2, -1)) >= MIN_FILLED
         isolated &= np.min([border.mean(axis=-1) for border in borders], axis=0) >= MIN_BORDER
-        isolated &= np.max([row.mean(axis=-1) for row in beyond], axis=0) < BEYOND
+        isolated &= np.max([row.mean(axis=-1) for row in beyond], axis=0) < MIN_BORDER
         for j, i in np.argwhere(isolated) + 1:
             yield upright[j : j + board.rows, i : i + board.columns]
 

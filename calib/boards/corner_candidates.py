@@ -5,6 +5,7 @@ They are searched in an image and in those derived from it, in which a board is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from calib.boards.board import MAX_SIDE
 from calib.models.camera import Array
 
 Grey = NDArray[np.float32]
@@ -30,9 +32,6 @@ MAX_ODD = 0.6
 MIN_CROSSING_RAD = np.deg2rad(18)
 # Least second derivative at a saddle point [grey levels / px^2].
 MIN_SADDLE = 0.6
-MAX_PER_LEVEL = 4000  # Most candidates of a level, so that the largest board fits: 61 x 61 corners.
-# cv2.remap expects images, not lists, so that samples are folded into rows of this length.
-REMAP_COLUMNS = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +93,11 @@ def describe_corners(image: Grey, pixels: Array, ring_px: float | Array) -> Corn
 def sample(image: Grey, pixels: Array) -> Array:
     """Return grey values (...) at pixels (..., 2), bilinear, with the border repeated."""
     flat = pixels.reshape(-1, 2).astype(np.float32)
-    padded = np.zeros((max(1, -(-len(flat) // REMAP_COLUMNS)) * REMAP_COLUMNS, 2), np.float32)
+    # cv2.remap expects images, not lists, so that samples are folded into a square.
+    side = math.isqrt(len(flat)) + 1
+    padded = np.zeros((side * side, 2), np.float32)
     padded[: len(flat)] = flat
-    u, v = padded.T.reshape(2, -1, REMAP_COLUMNS)
+    u, v = padded.T.reshape(2, side, side)
     values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values.ravel()[: len(flat)].reshape(pixels.shape[:-1]), float)
 
@@ -129,7 +130,8 @@ def _saddles(blurred: Grey, border: int) -> Array:
     peak = (strength == cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > MIN_SADDLE**2)
     peak[:border], peak[-border:], peak[:, :border], peak[:, -border:] = False, False, False, False
     row, column = np.nonzero(peak)
-    best = np.argsort(-strength[row, column], kind="stable")[:MAX_PER_LEVEL]
+    # So many that the largest board fits.
+    best = np.argsort(-strength[row, column], kind="stable")[: (MAX_SIDE + 1) ** 2]
     row, column = row[best], column[best]
     x, y, xx, yy, xy = (derivative[row, column].astype(float) for derivative in derivatives)
     determinant = xx * yy - xy * xy

@@ -25,9 +25,11 @@ from calib.models.camera import Array
 # Below the least value a step is in effect undamped, above the largest one it is lost in rounding.
 START_DAMPING, DAMPING_FACTOR = 1e-4, 10.0
 MIN_DAMPING, MAX_DAMPING = 1e-9, 1e8
-# Added to the diagonal of each block, so that a block without observations stays invertible: far below the information
-# of any observation.
-BLOCK_REGULARISATION = 1e-9
+# Width of robust functions in standard deviations of a coordinate: of normal errors 86 % of the efficiency of least
+# squares remains with the weights of Geman and McClure 1987, more with those of Huber and Cauchy.
+KERNEL_WIDTH = 2.5
+# Rounds of an estimate whose data or weights depend on its own result.
+ROUNDS = 3
 
 # The best step of central differences of a smooth function of about unit size: the cube root of a double's rounding.
 BEST_STEP = float(np.finfo(float).eps ** (1 / 3))
@@ -58,7 +60,8 @@ class ArrowSystem:
     def inverse_blocks(self, damping: float = 0.0) -> scipy.sparse.csr_matrix:
         """Return the inverse (K D, K D) of the damped blocks."""
         K, D, _ = self.C.shape
-        damped = self.C * (1 + damping * np.eye(D)) + BLOCK_REGULARISATION * np.eye(D)
+        # A block without observations stays invertible, by far less than the information of any observation.
+        damped = self.C * (1 + damping * np.eye(D)) + MIN_DAMPING * np.eye(D)
         return scipy.sparse.bsr_matrix((np.linalg.inv(damped), np.arange(K), np.arange(K + 1)), (K * D, K * D)).tocsr()
 
     def _reduced_by(self, inverse: scipy.sparse.csr_matrix, damping: float) -> tuple[Array, Array]:

@@ -28,16 +28,15 @@ WAVEFRONT_UNIT_M: Final = 1e-3
 # The length of the baseline is no parameter of a drive, whose images do not determine the scale.
 TRANSFORM_NAMES: Final = RIG_TRANSFORM_NAMES[:-1]
 ANGLE_UNIT_RAD: Final = 1.0 / 250.0
-# Times of exposure; a step moves the image by some tenths of a pixel at walking speed.
+# Times of exposure; a step is one of their units.
 UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
-TIME_UNITS: Final = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
+TIMES: Final = (UPPER_DELAY, LINE_TIME)
 S_PER_UNIT: Final = {UPPER_DELAY: 1e-3, LINE_TIME: 1e-6}
 # Tolerances of a nominal rig in the parameters' own units, by the name without its camera: those of mount and trigger,
 # and of a mirror whose rays pass the viewpoint within about a millimetre.
-NOMINAL_TURN_RAD: Final = math.radians(1.5)
-NOMINAL_SIGMAS: Final = {
-    **dict.fromkeys(("r_x", "r_y", "r_z"), NOMINAL_TURN_RAD),
-    **dict.fromkeys(("e_x", "e_y"), np.deg2rad(2.0)),
+NOMINAL_SIGMAS: Final[dict[str, float]] = {
+    **dict.fromkeys(("r_x", "r_y", "r_z"), math.radians(1.5)),
+    **dict.fromkeys(("e_x", "e_y"), math.radians(2.0)),
     **dict.fromkeys(("pu", "pv", "center_row", "center_column"), 3.0),
     **{UPPER_DELAY: 15.0, LINE_TIME: 30.0, "xi": 0.02},
     **dict.fromkeys(WAVEFRONT_NAMES, 1e-3),
@@ -122,7 +121,7 @@ class RigParameters:
     rig: Rig
     rig_names: tuple[str, ...]  # without wavefronts and times
     waves: tuple[str, ...] = ()
-    times: tuple[str, ...] = ()  # of TIME_UNITS
+    times: tuple[str, ...] = ()  # of TIMES
 
     @staticmethod
     def about(
@@ -162,7 +161,7 @@ class RigParameters:
     @property
     def units(self) -> Array:
         """One step (P,) in the parameters' own units."""
-        known = dict.fromkeys(TRANSFORM_NAMES, ANGLE_UNIT_RAD) | TIME_UNITS
+        known = dict.fromkeys(TRANSFORM_NAMES, ANGLE_UNIT_RAD) | dict.fromkeys(TIMES, 1.0)
         for side, mounted in self.rig.sides:
             own = [name.partition(" ")[2] for name in self.names if name.startswith(f"{side} ")]
             units = units_of(mounted.camera, own).tolist()
@@ -174,7 +173,7 @@ class RigParameters:
         """Standard deviations (P,) of the steps of a nominal rig."""
         sigmas = []
         for name, value, unit in zip(self.names, self.values.tolist(), self.units.tolist(), strict=True):
-            own = name if name in TIME_UNITS else name.split()[-1]
+            own = name if name in TIMES else name.split()[-1]
             relative = RELATIVE_SIGMA * abs(value) / unit
             is_higher = is_coefficient(own) and int(own[1:]) > 2
             steps = NOMINAL_STEPS.get(own, np.hypot(HIGHER_STEPS, relative) if is_higher else relative)
@@ -205,7 +204,7 @@ class RigParameters:
     def times_at(self, steps: Array) -> ShutterTimes:
         """Return the times of exposure after steps (P,); a time that is no parameter stays that of the rig."""
         own = dict(zip(self.times, steps[len(self.names) - len(self.times) :].tolist(), strict=True))
-        upper_s, line_s = (own.get(name, 0.0) * TIME_UNITS[name] * S_PER_UNIT[name] for name in TIME_UNITS)
+        upper_s, line_s = (own.get(name, 0.0) * S_PER_UNIT[name] for name in TIMES)
         return ShutterTimes(self.rig.times.upper_delay_s + upper_s, self.rig.times.line_time_s + line_s)
 
     def transform_steps(self, rig: Rig) -> Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.fit.least_squares import KERNEL_WIDTH
 from calib.models.camera import Array
 
 # Bins of the image: rings with equal numbers of corners, and sectors of azimuth.
@@ -13,9 +14,6 @@ RINGS, SECTORS = 6, 12
 # A misfit is reported if the systematic part exceeds this part of the noise, and this error, because smaller ones do
 # not change the motion estimate by a measurable amount.
 MAX_SYSTEMATIC_PART, MAX_SYSTEMATIC_PX = 0.5, 0.03
-# Residuals longer than this many times their median length are outliers: 3 of 100 million of a
-# normal distribution.
-OUTLIER_RATIO = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +42,10 @@ def residual_structure(pixels: Array, residuals: Array, center: tuple[float, flo
     A one-way analysis of variance with the bins as groups.
     """
     length = np.linalg.norm(residuals, axis=1)
-    known = length < OUTLIER_RATIO * np.nanmedian(length) if np.isfinite(length).any() else np.zeros(len(length), bool)
+    # Outliers are twice as far as the kernel reaches, by the median length: 3 of 100 million of a normal distribution.
+    known = (
+        length < 2 * KERNEL_WIDTH * np.nanmedian(length) if np.isfinite(length).any() else np.zeros(len(length), bool)
+    )
     offset, residuals = pixels[known] - center, residuals[known]
     bins = _bins(offset)
     # Radial and tangential components, so that an error that depends on the radius alone is the same in all sectors.

@@ -18,19 +18,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib import se3
-from calib.fit.least_squares import BEST_STEP, SIGMA_PER_MAD, central_differences
-from calib.models.camera import Array
+from calib.fit.least_squares import BEST_STEP, KERNEL_WIDTH, SIGMA_PER_MAD, central_differences
+from calib.models.camera import NEWTON_STEPS, Array
 from calib.rig import Rig
 
-MIN_POINTS = 30  # six for each unknown.
 # Points that count as one: neighbours share their texture, and so the error of the match, in all pairs that show it.
 # With 1, the rotation of right rigs is off by 1.1 to 3.8 sigma (rms of drives of development seeds, see
 # tests/bench/calibration.py); clusters of 10 degrees or of whole pairs explain no more of it than 1 does.
 CORRELATED_POINTS = 4.0
-ITERATIONS = 12  # enough: 70 of 72 estimates of test_rig_accuracy.py end before
-# Width of the weights (Geman and McClure 1987) in standard deviations of the residuals, so that of normal errors 86 %
-# of the efficiency of least squares remains.
-KERNEL_WIDTH = 2.5
 # Prior of the upper viewpoint's lateral shift: a mirror moves by no more than some degrees of the baseline.
 SHIFT_SIGMA_RAD = np.deg2rad(3.0)
 
@@ -63,16 +58,14 @@ class RigDrift:
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
 
 
-def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift | None:
-    """Estimate the drift from rays (N, 3) to the same points, in the rectified frame; None if they are too few.
+def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift:
+    """Estimate the drift from rays (N, 3) to the same points, in the rectified frame.
 
     Iteratively reweighted least squares; the weights (Geman and McClure 1987) limit the influence of false matches.
     """
-    if len(lower) < MIN_POINTS:
-        return None
     x = np.zeros(5)
     prior = np.diag([0.0, 0, 0, SHIFT_SIGMA_RAD**-2, SHIFT_SIGMA_RAD**-2])
-    for _ in range(ITERATIONS):
+    for _ in range(NEWTON_STEPS):
         residual, about = _residuals(x, lower, upper), x
         J = central_differences(
             lambda step, about=about: _residuals(about + step, lower, upper),  # type: ignore[misc]

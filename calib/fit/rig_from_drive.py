@@ -19,7 +19,16 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.least_squares import BEST_STEP, LOST_PX, ArrowSystem, Termination, minimise, robust_sigma
+from calib.fit.least_squares import (
+    BEST_STEP,
+    KERNEL_WIDTH,
+    LOST_PX,
+    ROUNDS,
+    ArrowSystem,
+    Termination,
+    minimise,
+    robust_sigma,
+)
 from calib.fit.parameters import RigParameters
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
@@ -28,16 +37,9 @@ from calib.rig import Rig
 
 Indices = NDArray[np.intp]
 Flags = NDArray[np.bool_]
-# Cauchy's function counts errors of more sigmas less, so that one of 3 sigmas has half of the weight.
-KERNEL = 3.0
 # Patches are matched to a tenth of a pixel, so that observations that fit no better than to a pixel show no rigid
 # world.
 MAX_SIGMA_PX = 1.0
-# A landmark is not one point of one surface if the RMS of its errors exceeds the first number of sigmas. An
-# observation is a wrong match if its error exceeds the second. The robust kernel alone would leave them some weight.
-LOOSE_LANDMARK, LOOSE_OBSERVATION = 2.0, 6.0
-# Loose landmarks are left out in several rounds, because the rig moves without them, and others become loose.
-SELECTIONS = 3
 # A search ends where a step reduces the cost by less than a share of it: the rough one while landmarks are still
 # selected, because the search goes on with the next selection, the fine one at the end.
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
@@ -123,7 +125,8 @@ def adjust_drive(
     prior = parameters.prior()
     problem = DriveProblem(parameters, observations, correlated * prior, np.asarray(fixed))
     state, sigma_px = problem.minimised(state, ROUGH_GAIN)
-    for number in range(SELECTIONS):
+    # Loose landmarks are left out in several rounds, because the rig moves without them, and others become loose.
+    for number in range(ROUNDS):
         kept, used = observations.only(problem.consistent(state, sigma_px))
         if sigma_px > MAX_SIGMA_PX:
             raise CalibError(
@@ -137,7 +140,7 @@ def adjust_drive(
             )
         observations, state = kept, replace(state, points=state.points[used])
         problem = replace(problem, observations=observations)
-        state, sigma_px = problem.minimised(state, FINE_GAIN if number == SELECTIONS - 1 else ROUGH_GAIN)
+        state, sigma_px = problem.minimised(state, FINE_GAIN if number == ROUNDS - 1 else ROUGH_GAIN)
     covariance = problem.covariance(state, sigma_px, correlated**2 * prior)
     return DriveAdjustment(parameters, state, observations, covariance, sigma_px, prior)
 
@@ -197,8 +200,10 @@ class DriveProblem:
         landmark, squared = self.observations.landmark, (self.residuals(state) ** 2).sum(axis=1)
         total = np.bincount(landmark, np.minimum(squared, 1.0), len(state.points))
         rms = np.sqrt(total / np.maximum(2 * np.bincount(landmark, minlength=len(state.points)), 1))
-        firm = (rms < LOOSE_LANDMARK * sigma_px)[landmark]
-        return np.asarray(firm & (squared < (LOOSE_OBSERVATION * sigma_px) ** 2))
+        # A landmark is not one point of one surface if the RMS of its errors exceeds the width of the kernel, an
+        # observation is a wrong match beyond twice of it. The kernel alone would leave them some weight.
+        firm = (rms < KERNEL_WIDTH * sigma_px)[landmark]
+        return np.asarray(firm & (squared < (2 * KERNEL_WIDTH * sigma_px) ** 2))
 
     def residuals(self, state: DriveState) -> Array:
         """Return measured minus modelled pixels (M, 2); LOST_PX where the model has no image."""
@@ -221,7 +226,9 @@ class DriveProblem:
     def cost(self, state: DriveState, scale: float) -> float:
         """Return the sum of Cauchy's function over the observations, and the prior's."""
         squared = (self.residuals(state) ** 2).sum(axis=1) / scale**2
-        return float(KERNEL**2 * np.log1p(squared / KERNEL**2).sum() + state.steps @ self.prior @ state.steps)
+        return float(
+            KERNEL_WIDTH**2 * np.log1p(squared / KERNEL_WIDTH**2).sum() + state.steps @ self.prior @ state.steps
+        )
 
     def scale(self, state: DriveState) -> float:
         """Return the standard deviation [px] of one coordinate, by the median."""
@@ -285,7 +292,7 @@ class DriveProblem:
         """Return derivatives and residuals in sigmas, with the weights of Cauchy's function."""
         seen, residual = self.observations, self.residuals(state)
         squared = (residual**2).sum(axis=1) / scale**2
-        root = np.sqrt(1 / (1 + squared / KERNEL**2))[:, None] / scale
+        root = np.sqrt(1 / (1 + squared / KERNEL_WIDTH**2))[:, None] / scale
         in_rig = self.in_rig(state, state.steps)
         by_rig_point = self._by_point(state.steps, in_rig) * root[:, :, None]
         by_pose = np.concatenate([by_rig_point, -by_rig_point @ se3.hat(in_rig)], axis=2)

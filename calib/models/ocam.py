@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models import wavefront as wavefronts
-from calib.models.camera import Array, OmniCamera, undistorted
+from calib.models.camera import CONVERGED_PART, NEWTON_STEPS, Array, OmniCamera, undistorted
 
 View = Literal["mirror", "direct"]
 # The tangential and the astigmatic terms, as files and results name them.
@@ -34,12 +34,6 @@ TANGENTIAL_NAMES, ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
 MAX_COEFFICIENTS = 64
 # Size of the table of radii in which the inversion starts, so that each solution stays within one interval.
 TABLE_SIZE = 1025
-# Newton steps on one table interval, because 3 reach the last bit, the others are for the model's end, where the slope
-# is 0.
-SOLVE_STEPS = 8
-# A Newton step that is shorter ends the search, because the error left is of the order of its square, below the last
-# bit.
-SOLVED_PX = 1e-9
 # A camera with a wavefront is exact for points at this distance; half of it and twice as far have the same error.
 DISTANCE_M = 1.5
 NO_WAVEFRONT = (0.0,) * wavefronts.TERMS
@@ -199,14 +193,15 @@ class OcamCamera:
         low, high = self._radii[above - 1], self._radii[above]
         rho = (low + high) / 2
         with np.errstate(all="ignore"):
-            for _ in range(SOLVE_STEPS):
+            for _ in range(NEWTON_STEPS):
                 height, slope = self.height_and_slope(rho)
                 value = height * r - z * rho
                 is_below = value < 0
                 low, high = np.where(is_below, rho, low), np.where(is_below, high, rho)
                 step = np.minimum(np.maximum(rho - value / (slope * r - z), low), high)
                 before, rho = rho, np.where(np.isnan(step), (low + high) / 2, step)
-                if not (np.abs(rho - before) > SOLVED_PX).any():
+                # The error left is of the order of the square of the step, below the last bit.
+                if not (np.abs(rho - before) > CONVERGED_PART).any():
                     break
         return np.where(np.isfinite(unit) & (angle <= self._angles[-1]), rho, np.nan)
 

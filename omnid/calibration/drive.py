@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.parameters import LINE_TIME, NOMINAL_TURN_RAD, UPPER_DELAY, RigParameters
+from calib.fit.least_squares import ROUNDS
+from calib.fit.parameters import NOMINAL_SIGMAS, TIMES, RigParameters
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_from_drive import (
@@ -32,14 +33,12 @@ from omnid.calibration.drive_observations import Drives, collect, observe_pairs
 from omnid.calibration.images import SIDES
 from omnid.calibration.rig_check import MAX_SKEW_S, check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
+from omnid.core.rig.column_finding import SIGMAS
 from omnid.core.stereo.triangulation import common_perpendicular
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
 
-# Most rounds: the second one tracks in panoramas that the rig of the first one has straightened. More follow while
-# lengths still change.
-MAX_ROUNDS = 4
 # Relative change of lengths in a round below which no further round is needed: a third of the scale's sigma after a
 # drive (0.3 % in rendered rooms).
 SETTLED = 1e-3
@@ -48,13 +47,6 @@ SETTLED = 1e-3
 SMALL_GAIN = 0.95
 # Distortion terms of omni cameras that are fitted although the file has none: a camera may be tilted below its mirror.
 DISTORTION = ("p1", "p2")
-TIMES = (UPPER_DELAY, LINE_TIME)
-# A camera's parameter that differs by more of the sigmas of a nominal rig is that of another camera: 1 of 16,000 normal
-# errors is larger.
-SIGNIFICANT_SIGMAS = 4.0
-# Rounds of matching columns before the first drive: each matches in panoramas that the one before has straightened, so
-# that wrong matches become fewer.
-PAIR_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +143,8 @@ def straightened(
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
     if float(np.median([abs(pair.skew_s) for pair in pairs])) > MAX_SKEW_S:
         return steps  # the motion between the exposures would be taken for errors of the centres
-    for _ in range(PAIR_ROUNDS):
+    # Each round matches in panoramas that the one before has straightened, so that wrong matches become fewer.
+    for _ in range(ROUNDS):
         state, observations = observe_pairs(pairs, parameters.at(steps), config)
         steps = adjust_pairs(parameters, replace(state, steps=steps), observations)
     finding = check_rig(pairs, parameters.at(steps), config.panorama).finding
@@ -172,7 +165,7 @@ def _in_rounds(
     steps (P,): of the parameters, to start from.
     """
     rig = parameters.at(steps)
-    for number in range(1, MAX_ROUNDS + 1):
+    for number in range(1, ROUNDS + 2):
         drives = collect(logs, rig, cameras, config)
         found = _adjusted(parameters, steps, drives)
         moved = scale_change(found, rig)
@@ -243,7 +236,7 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
     """
     change = (steps * parameters.units)[parameters.of_transform]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
-    limit = 3 * NOMINAL_TURN_RAD if parameters.rig.covariance is None else MAX_TURN_RAD
+    limit = 3 * NOMINAL_SIGMAS["r_x"] if parameters.rig.covariance is None else MAX_TURN_RAD
     away = np.abs(steps / parameters.nominal_sigmas)[: parameters.of_transform.start]
     worst = int(np.argmax(away))
     if max(turn, lean) > limit:
@@ -251,7 +244,7 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
             f"the upper camera is turned by {np.rad2deg(turn):.1f} deg and its baseline by {np.rad2deg(lean):.1f} deg "
             f"against the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
         )
-    elif away[worst] > SIGNIFICANT_SIGMAS:
+    elif away[worst] > SIGMAS:
         old, new = parameters.values[worst], (parameters.values + steps * parameters.units)[worst]
         reason = (
             f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "

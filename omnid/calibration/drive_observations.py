@@ -18,7 +18,7 @@ from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.config import Config
 from omnid.core.rig.column_finding import RigState, match
-from omnid.core.rig.drive_landmarks import DriveLandmarks, PanoramaObservations, View, image_pixels
+from omnid.core.rig.drive_landmarks import DriveLandmarks, View, in_images
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
@@ -38,7 +38,6 @@ MIN_KEYFRAMES = 15
 MIN_TURN_RAD = np.deg2rad(60)
 MIN_PATH_M = 2.0  # the same landmarks must be seen from near and from far
 MAX_LOST = 0.2  # share of the pairs
-NOISE_PX = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ def collect(logs: Sequence[Path], rig: Rig, cameras: LogCameras, config: Config)
 def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple[DriveState, DriveObservations]:
     """Return points that both cameras saw at once, each pair a keyframe in one place, without tracking."""
     place = geometry(rig, config.panorama)
-    dewarp, model = Dewarp(place, config.panorama), place.model(NOISE_PX)
+    dewarp, model = Dewarp(place, config.panorama), place.model(config.odometry.noise_px)
     found: list[tuple[Array, Array, Array]] = []
     for number, pair in enumerate(pairs):
         panoramas = dewarp.process(pair)
@@ -90,22 +89,21 @@ def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple
     points = se3.apply(
         place.T_rig_rect, triangulate(np.column_stack([lower, upper[:, 1]]), model.cylinder, model.baseline_m)
     )
-    count, landmark = len(points), np.arange(len(points))
-    seen = PanoramaObservations(
-        np.tile(keyframe, 2), np.tile(landmark, 2), np.repeat([0, 1], count), np.concatenate([lower, upper]), points
+    seen = DriveObservations(
+        np.tile(keyframe, 2),
+        np.tile(np.arange(len(points)), 2),
+        np.repeat([0, 1], len(points)),
+        np.concatenate([lower, upper]),
     )
-    pixels = image_pixels(seen, rig, place.cylinder)
-    known = np.isfinite(pixels).all(axis=1) & np.tile(np.isfinite(points).all(axis=1), 2)
-    observations = DriveObservations(seen.keyframe, seen.landmark, seen.camera, pixels)
-    observations, used = observations.only(known & np.tile(known[:count] & known[count:], 2))
+    observations, points = in_images(seen, points, rig, place.cylinder)
     T = np.tile(np.eye(4), (len(pairs), 1, 1))
-    return DriveState(T, points[used], np.zeros((len(pairs), 6)), np.zeros(len(pairs)), np.zeros(0)), observations
+    return DriveState(T, points, np.zeros((len(pairs), 6)), np.zeros(len(pairs)), np.zeros(0)), observations
 
 
 def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most: int) -> Drives:
     """Return keyframes of one drive, at most the given number, its landmarks, and their pixels in the images."""
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
-    landmarks = DriveLandmarks(place.model(NOISE_PX))
+    landmarks = DriveLandmarks(place.model(config.odometry.noise_px))
     T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
     since = 0
     with closing(cameras.reader(log, place.rig.topics)) as reader:
@@ -129,11 +127,8 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
             # Upper minus lower stamp; the rig's delay of the exposures is a parameter of its own.
             delays_s.append(seen.times.skew_s - place.rig.times.upper_delay_s)
     # 4. The observations in the images.
-    found = landmarks.observations()
-    pixels = image_pixels(found, place.rig, place.cylinder)
-    observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
-    observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
-    state = DriveState(np.array(T_rig_odom), found.points[used], np.array(twists), np.array(delays_s), np.zeros(0))
+    observations, points = in_images(*landmarks.observations(), place.rig, place.cylinder)
+    state = DriveState(np.array(T_rig_odom), points, np.array(twists), np.array(delays_s), np.zeros(0))
     return Drives(state, observations, (0,))
 
 

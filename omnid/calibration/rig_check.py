@@ -10,7 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from calib.fit.rig_drift import apply_drift
+from calib.fit.least_squares import ROUNDS
+from calib.fit.rig_drift import SHIFT_SIGMA_RAD, apply_drift
 from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras
 from omnid.calibration.images import TOLERANCE_NS, spread_pairs
@@ -32,12 +33,8 @@ from omnid.stages.synchronise import Decoder
 
 # Number of pairs that are used, spread over the log: some thousand matches of different places.
 PAIRS: Final = 24
-# Most corrections of the upper camera's pose: each finds more points than the one before, as more of them match.
-REFINEMENTS: Final = 3
 # Median time between the exposures of the pairs: the stamps of cameras that are triggered together scatter by less.
 MAX_SKEW_S: Final = 3e-3
-# No mirror moves this far to the side, deg of the baseline; a camera's centre that is some pixels off has this effect.
-NO_MIRROR_DEG: Final = 5.0
 RECALIBRATE = "the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board"
 NOT_OBSERVABLE = (
     "not observable without a board: the length of the baseline (kept), the cameras' intrinsics, and the "
@@ -57,14 +54,15 @@ class RigCheckResult:
     def has_changed_intrinsics(self) -> bool:
         """True if the columns show a change other than that of the upper camera's pose."""
         shift = np.zeros(2) if self.finding.drift is None else self.finding.drift.shift
-        return self.finding.left_px > DRIFTED_PX or bool(np.rad2deg(np.linalg.norm(shift)) > NO_MIRROR_DEG)
+        # A mirror hardly moves by two sigmas to the side; a camera's centre that is some pixels off has this effect.
+        return self.finding.left_px > DRIFTED_PX or bool(np.linalg.norm(shift) > 2 * SHIFT_SIGMA_RAD)
 
     def __str__(self) -> str:
         """Return the result as lines of text, the condition first."""
         finding = self.finding
         lines = [
             f"{finding.state}: {self.pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
-            f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px",
+            f"columns: median {finding.offset_px:+.3f} px",
         ]
         if (drift := finding.drift) is not None:
             turn, turn_sigma = np.rad2deg(drift.turn), np.rad2deg(drift.turn_sigma)
@@ -104,7 +102,8 @@ def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult,
 def with_upper_corrected(rig: Rig, pairs: Sequence[FramePair], found: RigCheckResult) -> tuple[Rig, str]:
     """Return the rig whose upper camera's pose is corrected by the drift that was found, and what remains, in words."""
     is_doubtful = found.has_changed_intrinsics
-    for _ in range(REFINEMENTS):
+    # Each correction finds more points than the one before, as more of them match.
+    for _ in range(ROUNDS):
         if found.finding.drift is None:
             raise OmnidError("calibrate drive: too few points match to correct the rig; calibrate it with a board")
         rig = apply_drift(rig, found.finding.drift)

@@ -25,8 +25,6 @@ from omnid.report.page import figure, page, table
 # Factor by which residuals are drawn longer.
 ARROW = 40.0
 WIDTH_PX = 1400  # of a panorama, or of two cameras side by side
-# Number of columns drawn through both panoramas.
-LINES = 24
 
 
 def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig, angles: Sequence[Sequence[AngleRow]]) -> str:
@@ -78,7 +76,7 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
         for side, mounted in zip(reversed(images.sides), (rig.upper, rig.lower), strict=True)
     ]
     canvas = cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR)
-    canvas[:, :: WIDTH_PX // LINES] = GREEN
+    canvas[:, :: WIDTH_PX // (2 * HOURS)] = GREEN
     return figure(
         np.asarray(canvas, np.uint8),
         f"{name}: the upper panorama above the lower one; a point is in the same column of both",

@@ -11,13 +11,12 @@ import cv2
 import numpy as np
 
 from calib.models.camera import Mask
-from calib.rim import find_rim
+from calib.rim import EDGE_PX, find_rim
 from omnid.calibration.images import Image, brightest, middle_px
+from omnid.core.stereo.tiles import SATURATED_GREY
 
 IMAGES: Final = 10  # Images of each camera: the rim is searched in their maximum.
-SATURATED: Final = 250  # grey level at which a pixel is too bright
 NOISE_GREY2: Final = 4.0  # of the variance of the grey levels: an image without any content has no focus
-EDGE_PX: Final = 3.0  # width of what counts as the edge of the rim and of the hub
 GREEN, RED = (80, 220, 80), (60, 60, 230)
 
 
@@ -45,7 +44,7 @@ def view_of(images: Sequence[Image]) -> CameraView:
         return CameraView(newest, rim, math.nan, math.nan, math.nan)
     grey = newest[world]
     focus = float(cv2.Laplacian(smooth, cv2.CV_32F)[world].var() / (grey.var() + NOISE_GREY2))
-    return CameraView(newest, rim, focus, float(grey.mean()), float((grey >= SATURATED).mean()))
+    return CameraView(newest, rim, focus, float(grey.mean()), float((grey >= SATURATED_GREY).mean()))
 
 
 def described(view: CameraView) -> str:

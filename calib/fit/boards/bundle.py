@@ -28,14 +28,16 @@ import numpy as np
 import scipy
 
 from calib import se3
-from calib.boards.board import MODE_NAMES, MODE_SIGMAS, MODE_UNITS, CalibrationBoard, PrintShape, all_modes
+from calib.boards.board import MODE_NAMES, MODE_SIGMAS, CalibrationBoard, PrintShape, all_modes
 from calib.errors import CalibError
 from calib.fit.boards.derivatives import pixel_derivatives
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.fit.least_squares import (
     BEST_STEP,
     DAMPING_FACTOR,
+    KERNEL_WIDTH,
     LOST_PX,
+    ROUNDS,
     START_DAMPING,
     ArrowSystem,
     Termination,
@@ -93,11 +95,6 @@ TWIST_NAMES: Final = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
 # A damped step hardly moves along a flat direction: so the search ends only with a nearly undamped step that lowers the
 # cost in its ninth digit.
 TERMINATION: Final = Termination(gain=1e-9, damping=1e-7)
-# Number of optimisations, each with the kernel's width estimated again, because the width depends on the residuals and
-# these on the width.
-KERNEL_ROUNDS: Final = 3
-# Width of Huber's kernel in standard deviations of one coordinate, because 1 of 23 normal residuals (2-D) is longer.
-HUBER_WIDTH: Final = 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +165,9 @@ def fit_boards(start: BoardRig, pixels: Array, board: CalibrationBoard, *, telec
     problem = _BoardProblem(pixels, board.points, reach_m, telecentric, np.inf)
     state = problem.state(start)
     sigma, damping = np.inf, START_DAMPING
-    for _ in range(KERNEL_ROUNDS):
+    for _ in range(ROUNDS):
         sigma = min(sigma, robust_sigma(state.residuals))
-        problem = replace(problem, kernel_px=HUBER_WIDTH * sigma)
+        problem = replace(problem, kernel_px=KERNEL_WIDTH * sigma)
         state = minimise(problem, state, TERMINATION, damping)
         damping = min(START_DAMPING, TERMINATION.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
     return problem.result(state)
@@ -225,7 +222,7 @@ class _BoardProblem:
         """Return the sum of Huber's function over the corners, and of the priors."""
         length = np.linalg.norm(state.residuals, axis=-1)
         huber = np.where(length <= scale, length**2, scale * (2 * length - scale))
-        return float(np.nansum(huber) + (scale / HUBER_WIDTH) ** 2 * (state.priors @ state.priors))
+        return float(np.nansum(huber) + (scale / KERNEL_WIDTH) ** 2 * (state.priors @ state.priors))
 
     def normal_equations(self, state: _State, scale: float, fields: Array | None = None) -> ArrowSystem:
         """Return the normal equations; fields (K, C, N, 2, F): further unknowns after all others, 0 now."""
@@ -237,14 +234,14 @@ class _BoardProblem:
         J_common, J_pose = ((root * J).reshape(K, -1, J.shape[-1]) for J in (J_common, J_pose))
         r = (root[..., 0] * residual).reshape(K, -1)
         # The priors count in residuals of one standard deviation of a coordinate.
-        own = self._prior_jacobian(state.rig) * (scale / HUBER_WIDTH)
+        own = self._prior_jacobian(state.rig) * (scale / KERNEL_WIDTH)
         own = np.pad(own, ((0, 0), (0, J_common.shape[-1] - own.shape[1])))
         flat = J_common.reshape(-1, J_common.shape[-1])
         return ArrowSystem(
             A=flat.T @ flat + own.T @ own,
             B=(J_common.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(flat.shape[1], 6 * K),
             C=J_pose.swapaxes(1, 2) @ J_pose,
-            a=flat.T @ r.ravel() - own.T @ state.priors * (scale / HUBER_WIDTH),
+            a=flat.T @ r.ravel() - own.T @ state.priors * (scale / KERNEL_WIDTH),
             c=np.einsum("kri,kr->ki", J_pose, r).ravel(),
         )
 
@@ -281,7 +278,7 @@ class _BoardProblem:
         cameras = [[*units_of(camera, rig.names), 1.0] for camera in rig.cameras]
         # The focal length is about a quarter of the image.
         twist = np.repeat([self.reach_m, 1.0], 3) / (min(rig.cameras[0].size) / 4)
-        return np.concatenate([*cameras, *([twist] if len(cameras) > 1 else []), MODE_UNITS])
+        return np.concatenate([*cameras, *([twist] if len(cameras) > 1 else []), MODE_SIGMAS])
 
     def _moved(self, rig: BoardRig, common: Array, blocks: Array) -> BoardRig:
         """Return the rig after steps of the common unknowns (P,) and of the poses (K, 6)."""
@@ -328,7 +325,7 @@ class _BoardProblem:
             for side in range(len(rig.cameras))
         ]
         twist = np.zeros((0, 6 * (len(blocks) - 1)))
-        return np.asarray(scipy.linalg.block_diag(*blocks, twist, np.diag(MODE_UNITS / MODE_SIGMAS)))
+        return np.asarray(scipy.linalg.block_diag(*blocks, twist, np.eye(len(MODE_SIGMAS))))
 
     def _camera_priors(self, rig: BoardRig, side: int, steps: Array) -> Array:
         """Return the differences of a camera after steps of its parameters and radius from what is expected of it."""

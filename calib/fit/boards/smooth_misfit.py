@@ -19,8 +19,6 @@ from calib.models.camera import Array
 # Nodes of the fields along the diameter of the seen part of an image: five follow three waves over the azimuth and a
 # turning point over the radius. Each field is as wide as the distance of two nodes.
 NODES = 5
-# Nodes farther from the centre, as a fraction of the largest radius, are left out: no corner determines them.
-MAX_RADIUS = 1.3
 # Values of tau / sigma over which the posterior is summed: steps of 4 % are fine enough for any ratio.
 RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])
 # Smaller eigenvalues of what the fields explain beyond the parameters, as a fraction of the largest, are rounding.
@@ -40,7 +38,6 @@ def smooth_fields(pixels: Array, cameras: int) -> Array:
         radius = float(np.linalg.norm(known - center, axis=1).max())
         line = np.linspace(-1, 1, NODES)
         nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-        nodes = nodes[np.linalg.norm(nodes, axis=1) <= MAX_RADIUS]
         away = ((part[:, :, None] - center) / radius - nodes) / width
         gaussian = np.exp(-0.5 * (away**2).sum(axis=3, keepdims=True))
         own.append(np.nan_to_num(-away * gaussian).swapaxes(2, 3))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from calib import se3
@@ -22,14 +23,6 @@ from calib.models.ocam import OcamCamera, View
 # The polynomial of a surface without a tip has even powers of rho.
 POWERS = np.array([0, 2, 4])
 
-# Grid search for the centre: start half width as a fraction of the image.
-SEARCH_PART = 0.16
-# Points per axis of the first round and of the others. Each goes from the best point of the last one half-way to its
-# neighbours, and a tenth farther.
-FIRST_SIDE, SEARCH_SIDE = 5, 3
-SEARCH_PART_OF_STEP = 0.55
-# Width at which the search ends, because the fit that follows refines the centre.
-SEARCH_END_PX = 0.5
 # Guards against division by zero.
 TINY = np.finfo(float).tiny
 
@@ -63,14 +56,14 @@ def solve_linear(pixels: Array, points: Array, size: tuple[int, int], view: View
     """
     width, height = size
     xy1, scale_px = np.column_stack([points[:, :2], np.ones(len(points))]), min(size) / 2
-    # 1. The centre, by the median view: one bad image does not determine it.
-    center, reach, side = np.array([(height - 1) / 2, (width - 1) / 2]), SEARCH_PART * max(size), FIRST_SIDE
-    while reach > SEARCH_END_PX:
-        steps = np.linspace(-reach, reach, side)
-        trials = [center + np.array([row, column]) for row in steps for column in steps]
-        errors = [float(np.nanmedian(_solve(pixels, xy1, scale_px, trial)[2])) for trial in trials]
-        center = trials[int(np.argmin(errors))]
-        reach, side = SEARCH_PART_OF_STEP * (steps[1] - steps[0]), SEARCH_SIDE
+    # 1. The centre, by the median view: one bad image does not determine it. The fit that follows refines it.
+    found = scipy.optimize.minimize(
+        lambda center: float(np.nanmedian(_solve(pixels, xy1, scale_px, center)[2])),
+        np.array([(height - 1) / 2, (width - 1) / 2]),
+        method="Nelder-Mead",
+        options={"xatol": 0.5, "fatol": np.inf},
+    )
+    center = np.asarray(found.x)
     # 2. Rigid poses in the camera's frame; for a mirror z is negated.
     coefficients, columns, errors_rad = _solve(pixels, xy1, scale_px, center)
     if view == "mirror":

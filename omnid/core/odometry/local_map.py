@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.panorama import MIN_RADIUS
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, RigVelocity
 from omnid.core.odometry.plane_patches import REACH_PX, AlignedPatches, align, moved_slopes, plane_templates
 from omnid.core.odometry.pose_estimation import CORRELATED
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.stereo.triangulation import MIN_RADIUS2_M2, point_covariance, triangulate, view
+from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
@@ -203,7 +204,7 @@ class LocalMap:
         T_curr_anchor, points = self.from_anchors(se3.inverse(T_odom_rect), rows), self.table.anchor_points[rows]
         P = self.table.anchor_covariance[rows]
         seen = (T_curr_anchor[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_curr_anchor[:, :3, 3]
-        r2 = np.maximum((seen[:, :2] ** 2).sum(axis=1), MIN_RADIUS2_M2)
+        r2 = np.maximum((seen[:, :2] ** 2).sum(axis=1), MIN_RADIUS**2)
         predicted = self._model.cylinder.focal_px * self._model.baseline_m / np.sqrt(r2)
         H = np.einsum("ni,nij->nj", -(predicted / r2)[:, None] * seen[:, :2], T_curr_anchor[:, :2, :3])
         # 2. The update, without outliers.

@@ -7,12 +7,13 @@ which is some tenths of a per cent of the scale.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.fit.rig_from_drive import DriveObservations
 from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
@@ -52,17 +53,6 @@ class View:
     T_odom_rect: Array  # (4, 4)
 
 
-@dataclass(frozen=True, slots=True)
-class PanoramaObservations:
-    """Pixels (M, 2) in the lower (camera 0) or upper (1) panorama of landmarks, seen from keyframes."""
-
-    keyframe: Indices  # (M,)
-    landmark: Indices  # (M,)
-    camera: Indices  # (M,)
-    pixels: Array  # (M, 2)
-    points: Array  # (L, 3) m, in odom
-
-
 class DriveLandmarks:
     """Tracks landmarks from keyframe to keyframe; keeps the images of the newest MAX_KEYFRAMES keyframes only."""
 
@@ -82,14 +72,17 @@ class DriveLandmarks:
             self._follow(view)
         self._start_landmarks(view)
 
-    def observations(self) -> PanoramaObservations:
-        """Return all observations of the landmarks that MIN_KEYFRAMES have seen, numbered from 0."""
+    def observations(self) -> tuple[DriveObservations, Array]:
+        """Return all observations, in the panoramas, of landmarks that MIN_KEYFRAMES have seen, numbered from 0.
+
+        Also the landmarks (L, 3) [m] in odom.
+        """
         keyframe, landmark, camera = (np.concatenate([part[i] for part in self._found]) for i in range(3))
         count = np.bincount(landmark[camera == 0], minlength=len(self._points))
         kept = count[landmark] >= MIN_KEYFRAMES
         used, numbers = np.unique(landmark[kept], return_inverse=True)
         pixels = np.concatenate([part[3] for part in self._found])
-        return PanoramaObservations(keyframe[kept], numbers, camera[kept], pixels[kept], self._points[used])
+        return DriveObservations(keyframe[kept], numbers, camera[kept], pixels[kept]), self._points[used]
 
     def _follow(self, current: View) -> None:
         """Find the landmarks of the newest keyframe in the next one, in both of its panoramas."""
@@ -151,12 +144,17 @@ def _is_set(flags: Flags, pixels: Array) -> Flags:
     return np.asarray(flags[np.clip(row, 0, flags.shape[0] - 1), column % flags.shape[1]])
 
 
-def image_pixels(observed: PanoramaObservations, rig: Rig, cylinder: Cylinder) -> Array:
-    """Return the pixels (M, 2) in the cameras' own images, through the rig that made the panoramas; NaN outside."""
-    rays = cylinder.rays(observed.pixels)
-    pixels = np.full(observed.pixels.shape, np.nan)
+def in_images(seen: DriveObservations, points: Array, rig: Rig, cylinder: Cylinder) -> tuple[DriveObservations, Array]:
+    """Return observations in panoramas as those in the cameras' images, and the landmarks (L, 3) that are left.
+
+    rig: the one that made the panoramas. What has no image or no finite point is left out.
+    """
+    rays = cylinder.rays(seen.pixels)
+    pixels = np.full(seen.pixels.shape, np.nan)
     for side, mounted in enumerate((rig.lower, rig.upper)):
         R_cam_rect = mounted.T_cam_rig[:3, :3] @ rig.T_rect_rig[:3, :3].T
-        at = observed.camera == side
+        at = seen.camera == side
         pixels[at] = mounted.camera.project(rays[at] @ R_cam_rect.T)
-    return pixels
+    known = np.isfinite(pixels).all(axis=1) & np.isfinite(points[seen.landmark]).all(axis=1)
+    kept, used = replace(seen, pixels=pixels).only(np.asarray(known))
+    return kept, points[used]

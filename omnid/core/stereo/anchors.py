@@ -25,11 +25,9 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 CELL_PX = 32  # side of a cell, because the courses of most brick walls are lower
-# Samples on the line to the anchor of a neighbouring cell; enough: every fourth pixel of two cells.
-LONG_LINE_SAMPLES = 16
-SHORT_LINE_SAMPLES = 8  # Samples on the line to the nearest anchor; enough: every fourth pixel of a cell.
-NEW_ANCHOR_MARGIN = 2.0  # grey levels by which the second candidate of a new anchor must be worse: errors propagate
-CLEAR_MARGIN = 1.0  # the same of an ordinary point; by trial on development seeds
+# Grey levels by which the second candidate of a point must be worse; twice as many for a new anchor, because errors
+# propagate. By trial on development seeds.
+CLEAR_MARGIN = 1.0
 CHUNK_LINES = 4_000  # lines sampled at a time, so that their pixels stay in the processor's cache
 NO_ANCHOR = -1  # because indices are never negative
 
@@ -93,7 +91,7 @@ class AnchorPropagation:
         # 3. All other points are decided by the line to their nearest anchor.
         anchor = self._nearest_anchors(ambiguous & ~new_anchors)
         rows = candidates.of(anchor != NO_ANCHOR)
-        along = self._line_differences(rows.point, rows.disparity, anchor[rows.point], SHORT_LINE_SAMPLES)
+        along = self._line_differences(rows.point, rows.disparity, anchor[rows.point])
         best, margin = rows.best(rows.difference + along, len(sure))
         self._assign(rows, best, anchor != NO_ANCHOR)
         return np.asarray(new_anchors | (margin > CLEAR_MARGIN))
@@ -132,10 +130,10 @@ class AnchorPropagation:
         """Decide points by the mean over the lines to all anchors around; return those (N,) with a large margin."""
         anchors = self._anchors_around(rows.point)
         row, k = np.nonzero(anchors != NO_ANCHOR)
-        along = self._line_differences(rows.point[row], rows.disparity[row], anchors[row, k], LONG_LINE_SAMPLES)
+        along = self._line_differences(rows.point[row], rows.disparity[row], anchors[row, k], cells=2)
         mean = np.bincount(row, along, len(anchors)) / np.count_nonzero(anchors != NO_ANCHOR, axis=1)
         best, margin = rows.best(rows.difference + mean.astype(np.float32), len(self.disparity))
-        decided = margin > NEW_ANCHOR_MARGIN
+        decided = margin > 2 * CLEAR_MARGIN
         self._assign(rows, best, decided)
         return np.asarray(decided)
 
@@ -152,11 +150,11 @@ class AnchorPropagation:
         chosen[points] = np.take_along_axis(anchors, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
         return chosen
 
-    def _line_differences(self, point: Indices, disparity: Indices, anchor: Indices, samples: int) -> Array:
-        """Return the line differences (M,) of points at disparities against anchors."""
+    def _line_differences(self, point: Indices, disparity: Indices, anchor: Indices, cells: int = 1) -> Array:
+        """Return the line differences (M,) of points at disparities against anchors that are so many cells away."""
         start = np.stack([self._column[point], self._row[point], disparity.astype(np.float32)])
         end = np.stack([self._column[anchor], self._row[anchor], self.disparity[anchor].astype(np.float32)])
-        return line_difference(self._images, start, end, samples)
+        return line_difference(self._images, start, end, cells * CELL_PX // 4)  # every fourth pixel
 
     def _assign(self, rows: Candidates, best: Indices, decided: Flags) -> None:
         self.disparity[decided] = rows.disparity[best[decided]]

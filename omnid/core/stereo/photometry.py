@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.stereo.tiles import TileSums
+from omnid.core.stereo.tiles import MEASURED_NOISE_GREY, TileSums
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -39,8 +39,7 @@ SMOOTHEST_PERCENT = 5.0
 # bilinearly.
 NOISE_SCALE = 6.1
 BANDS, BAND_ROWS = 4, 24  # rows in which noise is measured: all would take milliseconds
-MIN_BLOCKS = 20  # With fewer visible blocks the noise is not known, because the smoothest of few have texture.
-UNKNOWN_NOISE = 1.0  # grey levels.
+MIN_BLOCKS = 20  # With fewer visible blocks the noise is unknown, because the smoothest of few have texture.
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +106,9 @@ def noise_sigma(panorama: Image, visible: Flags) -> float:
         magnitude, share = _blocks(np.abs(difference)), _blocks(shown)
         means.append(magnitude[share == 1])
     found = np.concatenate(means)
-    return UNKNOWN_NOISE if len(found) < MIN_BLOCKS else NOISE_SCALE * float(np.percentile(found, SMOOTHEST_PERCENT))
+    return (
+        MEASURED_NOISE_GREY if len(found) < MIN_BLOCKS else NOISE_SCALE * float(np.percentile(found, SMOOTHEST_PERCENT))
+    )
 
 
 def _blocks(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -21,7 +21,6 @@ PREFILTER_CAP: Final = 31  # StereoSGBM limits the gradients that it compares to
 SUBPIXEL: Final = 16  # StereoSGBM returns sixteenths of a pixel, and searches a multiple of so many disparities
 SCALE: Final = 2  # the prior is at half the resolution, because at a quarter the courses of a brick wall are one grey
 FILL_PX: Final = 5  # Unknown pixels of the prior take the largest disparity so near, so that none is a hole.
-REACH_PX: Final = 2  # The search reaches this far from the prior, because a pixel of the prior is two pixels here.
 MIN_DISPARITY_PX: Final = 0.5  # a smaller one is a point at infinity, within the noise; by trial on development seeds
 
 
@@ -68,12 +67,12 @@ class SemiGlobalSearch:
         if column_shift is not None:
             columns = columns + column_shift.at_infinity + column_shift.per_disparity * prior
         warped = cv2.remap(upper, columns, self._rows + prior, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        padded = np.asarray(cv2.copyMakeBorder(warped, REACH_PX, REACH_PX, 0, 0, cv2.BORDER_REPLICATE), np.uint8)
-        # 2. The SAD of the pixels at shifts up to REACH_PX, and its minimum.
-        planes = (sad(lower, padded[k : k + height], self._window_px) for k in range(2 * REACH_PX + 1))
+        padded = np.asarray(cv2.copyMakeBorder(warped, SCALE, SCALE, 0, 0, cv2.BORDER_REPLICATE), np.uint8)
+        # 2. The SAD of the pixels at shifts up to one pixel of the prior, and its minimum.
+        planes = (sad(lower, padded[k : k + height], self._window_px) for k in range(2 * SCALE + 1))
         costs = np.array([np.take(plane.reshape(-1), pixels, mode="clip") for plane in planes])
         is_minimum = local_minima(costs, self._max_cost)
-        shift = subpixel(costs, np.where(is_minimum, costs, NO_MATCH).argmin(axis=0)) - REACH_PX
+        shift = subpixel(costs, np.where(is_minimum, costs, NO_MATCH).argmin(axis=0)) - SCALE
         # 3. The disparity, by the prior between the two nearest rows.
         row = pixels // width + shift
         above = np.clip(np.floor(row).astype(np.intp), 0, height - 2)

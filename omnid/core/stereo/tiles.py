@@ -38,7 +38,9 @@ TILE_ROWS: Final = 4  # 63 rows at scale 1.
 SPACING_PX: Final = 2
 LEAST_SAMPLES: Final = 100
 SATURATED_GREY: Final = 250  # grey level from which a pixel is saturated
-JUDGED_SHARE: Final = 0.5  # of a tile that shows the world
+# Share of a tile that must show the world, and share of the judged tiles of a column beyond which its direction is
+# unknown if they are blind.
+MOST: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +67,7 @@ class TileSampler:
         self._before: Image | None = None
         self.pixels = self._sums(np.asarray(self._mask & 1, np.uint8))
         # Tiles that show less of the world are not judged.
-        self.judged = self.pixels >= JUDGED_SHARE * np.diff(self._rows)[:, None] * np.diff(self._columns)
+        self.judged = self.pixels >= MOST * np.diff(self._rows)[:, None] * np.diff(self._columns)
 
     def add(self, panorama: Image) -> TileSums:
         """Return the sums of the next panorama (H, W)."""
@@ -98,10 +100,8 @@ SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts, because one may be a glitch of a driver
 # Share of the judged tiles that must change before others are dead, because else the whole image is still.
 LEAST_ALIVE: Final = 0.1
-# Mean change between two images with independent normal noise of sigma: 2 sigma / sqrt(pi), exact to 0.03 %.
-NOISE_CHANGE: Final = 1.128
-# Of it, because the noise is that of the smoothest blocks, and pixels of a panorama are interpolated from compressed
-# images: in the sample log live tiles change by a fifth of it at least.
+# Share of the mean change by noise that a live tile shows at least, because the noise is that of the smoothest blocks,
+# and pixels of a panorama are interpolated from compressed images: in the sample log it is a fifth.
 NOISE_SHARE: Final = 0.1
 MEASURED_NOISE_GREY: Final = 1.0  # less is that of rounding and compression, and says nothing about a tile
 # Cameras that remove noise repeat plain tiles while the base is at rest, so that a tile without texture is dead only if
@@ -117,9 +117,6 @@ SATURATED_SHARE: Final = 0.8  # of the pixels of a tile.
 BLURRED_SHARE: Final = 0.1
 BLURRED_COLUMNS: Final = 3
 LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise, because with less texture no blur is seen.
-COMPARED_COLUMNS: Final = 15  # Columns that must have this energy, because else a single poster decides what is usual.
-# A column's direction is unknown if a larger share of its judged tiles is blind.
-BLIND_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +199,7 @@ class TileMonitor:
             blind[side] |= self._judged & self._blurred(side, energy[side], energy[other], noise_grey[other])
         # 3. Directions.
         counts = np.maximum(self._judged.sum(axis=0), 1)
-        columns = {side: dead[side].any(axis=0) | (blind[side].sum(axis=0) > BLIND_SHARE * counts) for side in SIDES}
+        columns = {side: dead[side].any(axis=0) | (blind[side].sum(axis=0) > MOST * counts) for side in SIDES}
         for side in SIDES:
             self._since_ns[side] = (self._since_ns[side] or stamp_ns) if columns[side].any() else 0
         if not any(states[side].any() for states in (dead, blind) for side in SIDES):
@@ -218,7 +215,9 @@ class TileMonitor:
         """
         if is_first:
             return np.zeros_like(self._judged)
-        least = NOISE_SHARE * NOISE_CHANGE * noise_grey if noise_grey >= MEASURED_NOISE_GREY else 0.0
+        # The mean change between two images with independent normal noise of sigma is 2 sigma / sqrt(pi).
+        of_noise = 2 * noise_grey / np.sqrt(np.pi)
+        least = NOISE_SHARE * of_noise if noise_grey >= MEASURED_NOISE_GREY else 0.0
         shows = self._judged & ~blind
         is_still = shows & (change <= least)
         lively = self._lively[side]
@@ -247,7 +246,8 @@ class TileMonitor:
         textured = other > LEAST_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
         ratio = energy / np.maximum(other, 1e-6)
         is_faint = np.zeros(self._columns, bool)
-        if textured.sum() >= COMPARED_COLUMNS:
+        # With texture in less than a quarter of a turn, a single poster would decide what is usual.
+        if textured.sum() >= TILE_COLUMNS // 4:
             is_faint = textured & (ratio < BLURRED_SHARE * float(np.median(ratio[textured])))
         if not is_faint.any():
             self._faint[side] = np.zeros(self._columns, np.intp)

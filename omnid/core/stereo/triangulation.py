@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.panorama import Cylinder
+from calib.panorama import MIN_RADIUS, Cylinder
 
 Array = NDArray[np.float64]
 
-# Squared length of the cross product of two rays below which they count as parallel; rounding of 1e-7, squared.
-PARALLEL_CROSS2 = 1e-14
-MIN_DISPARITY_RAD = 1e-7  # the same for the rays of a view, which have r = 1; rounding: a point 1,000 km away
-MIN_RADIUS_M = 1e-9  # Distance from the axis below which a point has no disparity, because it lies on the axis.
-MIN_RADIUS2_M2 = 1e-12  # the same, squared, in derivatives; so that no division is by zero
+# Angle below which two rays count as parallel: a point 1,000 km away, because of rounding.
+MIN_DISPARITY_RAD = 1e-7
 
 
 def common_perpendicular(lower_rays: Array, upper_rays: Array, upper_origin: Array) -> Array:
@@ -26,7 +23,7 @@ def common_perpendicular(lower_rays: Array, upper_rays: Array, upper_origin: Arr
     """
     normal = np.cross(lower_rays, upper_rays)
     squared = (normal**2).sum(axis=1)
-    squared = np.where(squared > PARALLEL_CROSS2, squared, np.nan)
+    squared = np.where(squared > MIN_DISPARITY_RAD**2, squared, np.nan)
     along_lower = (np.cross(upper_origin, upper_rays) * normal).sum(axis=1) / squared
     along_upper = (np.cross(upper_origin, lower_rays) * normal).sum(axis=1) / squared
     middle = (along_lower[:, None] * lower_rays + along_upper[:, None] * upper_rays + upper_origin) / 2
@@ -48,14 +45,14 @@ def triangulate(views: Array, cylinder: Cylinder, baseline_m: float) -> Array:
 def view(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
     """Return views (N, 3) = (column, row in lower, row in upper) [px] of points (N, 3) [m] in the rectified frame."""
     lower = cylinder.pixels(points)
-    disparity = cylinder.focal_px * baseline_m / np.maximum(np.hypot(points[:, 0], points[:, 1]), MIN_RADIUS_M)
+    disparity = cylinder.focal_px * baseline_m / np.maximum(np.hypot(points[:, 0], points[:, 1]), MIN_RADIUS)
     return np.column_stack([lower, lower[:, 1] + disparity])
 
 
 def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
     """Return the derivatives (N, 3, 3) [px/m] of the view (column, lower row, upper row) by the point."""
     x, y, z = points.T
-    r2 = np.maximum(x * x + y * y, MIN_RADIUS2_M2)
+    r2 = np.maximum(x * x + y * y, MIN_RADIUS**2)
     r, f = np.sqrt(r2), cylinder.focal_px
     J = np.zeros((len(points), 3, 3))
     J[:, 0, 0], J[:, 0, 1] = f * y / r2, -f * x / r2

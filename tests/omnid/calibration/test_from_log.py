@@ -17,8 +17,7 @@ import omnid
 from calib import se3
 from calib.panorama import Cylinder
 from calib.rig_file import read_rig
-from omnid.calibration.fixed_parts import HEADINGS, FixedParts
-from omnid.calibration.from_log import HeightCalibration, MaskCalibration, on_floor
+from omnid.calibration.from_log import HEADINGS, FixedParts, HeightCalibration, MaskCalibration, on_floor
 from omnid.cli import main
 from omnid.core.floor import Floor
 from omnid.core.types.panorama import PaddedPanorama
