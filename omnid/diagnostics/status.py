@@ -180,34 +180,17 @@ def stage_stats(stage: StageStats, rate_hz: float = math.nan) -> Stats:
     return {**counts, **times(status_names.WORK, stage.wall)}
 
 
-RIG_WORDS = {
-    RigState.UNCHECKED: ("_words", "not checked yet: the robot must drive past different places"),
-    RigState.FITS: ("_words", "fits"),
-    RigState.DRIFTED: (
-        "_warning",
-        "drifted: run omnid calibrate drive --only check on a recording; -o corrects the rotation of the upper camera",
-    ),
-    RigState.EXCHANGED: ("_error", "the cameras are exchanged: exchange them in the configuration"),
-    RigState.BROKEN: (
-        "_error",
-        "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: run omnid "
-        "calibrate drive --only check on a recording",
-    ),
-}
-
-
 def rig_stats(health: RigHealth) -> Stats:
     """Return the state of the rig, and the evidence of the newest finding."""
-    finding, start = health.finding, health.start_finding
     stats = {Key.STATE: health.state, "new_views": health.new_views, "needed_views": VIEWS}
-    severity, words = RIG_WORDS[health.state]
-    if health.warning and not finding:  # the words of the first pairs count while the drive has shown nothing
-        severity, words = "_error" if severity == "_error" else "_warning", health.warning
-    stats[severity] = words
-    if start is not None:
-        stats["exchanged_matches"] = start.exchanged_matches
-    if (newest := finding or start) is not None:
-        stats |= {name: getattr(newest, name) for name in ("turn_deg", "offset_px", "left_px", "matches", "tried")}
+    if warning := health.warning:
+        stats["_error" if health.state.is_contradicted else "_warning"] = warning
+    elif health.state is RigState.FITS:
+        stats["_words"] = "fits"
+    else:
+        stats["_words"] = "not checked yet: the robot must drive past different places"
+    if (found := health.finding) is not None:
+        stats |= {name: getattr(found, name) for name in ("turn_deg", "offset_px", "left_px", "matches", "tried")}
     return stats
 
 

@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.fit.least_squares import SIGMA_PER_MAD
 from calib.fit.rig_drift import RigDrift, estimate_rig_drift
 from calib.panorama import Cylinder, at_scale
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.tracking import KltSettings, track
+from omnid.core.stereo.semiglobal import MIN_DISPARITY_PX
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import PixelTimes
 
@@ -65,9 +65,6 @@ ASIDE_PX: Final = 5
 DOWN_PX: Final = 30
 # Least correlation of a coarse match, because the search is wide, and a lower one lets more chance matches pass.
 MIN_CORRELATION: Final = 0.8
-# Least disparity: that of points at infinity is 0, and noise makes it negative for some of them, as exchanged cameras
-# do for all.
-MIN_DISPARITY_PX: Final = 0.5
 # Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than the coarse search errs.
 KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
 # Standard deviation of a coarse patch with contrast, grey levels, because noise alone, averaged over COARSE^2 pixels,
@@ -197,18 +194,10 @@ SIGMAS: Final = 4.0
 # Least part of the points with contrast that match: with a rig that is wrong by many degrees they match by chance only.
 # Corners without contrast are noise, which matches with no rig.
 MIN_MATCHED_PART: Final = 0.08
-MIN_CONTRAST_POINTS: Final = 400
 SECTORS: Final = 12  # Sectors of azimuth, 30 deg each, because that is about the width of a wall in a room.
-# Matches for the median of a sector, so that it is known to 1.25 / sqrt(20), about a quarter of the spread.
-MIN_IN_SECTOR: Final = 20
 # Median residual of the sectors from which a rig has drifted: changed intrinsics bend the columns all around, while
 # wrong matches on one wall change one sector.
 DRIFTED_PX: Final = 0.3
-# Scatter of the columns in the first pairs from which a rig has drifted: right rigs have less than 0.45 px, other
-# mirrors 0.3 to 7 px. It is the same at all scales, because matches err by parts of a pixel at each.
-SCATTERED_PX: Final = 0.6
-# Matches with the cameras exchanged, per match: right rigs have up to 0.41, exchanged ones 2.0 or more.
-EXCHANGED_RATIO: Final = 1.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,9 +205,8 @@ class RigFinding:
     """Result of the check."""
 
     found: Matches
-    exchanged_matches: int | None  # matches with the cameras exchanged; None: not tried
+    exchanged_matches: int  # matches with the cameras exchanged; 0 if that was not tried
     offset_px: float  # median of upper minus lower columns
-    spread_px: float  # 1.48 times the median absolute deviation
     left_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
     drift: RigDrift | None
 
@@ -235,17 +223,14 @@ class RigFinding:
     @property
     def state(self) -> RigState:
         """The state of the rig by this finding alone."""
-        matches, exchanged, clear = self.matches, self.exchanged_matches, self.found.clear
-        if exchanged is not None and max(matches, exchanged) >= MIN_MATCHES and exchanged > EXCHANGED_RATIO * matches:
+        matches, exchanged, enough = self.matches, self.exchanged_matches, MIN_MATCHED_PART * self.found.clear
+        if max(matches, exchanged) >= MIN_MATCHES and exchanged > matches:
             return RigState.EXCHANGED
-        if exchanged is None and clear >= MIN_CONTRAST_POINTS and matches < MIN_MATCHED_PART * clear:
+        if matches < MIN_MATCHES <= enough or self.misfit_deg > BROKEN_DEG:
             return RigState.BROKEN
         if self.drift is None:
             return RigState.UNCHECKED
-        if self.misfit_deg > BROKEN_DEG:
-            return RigState.BROKEN
-        is_bent = self.left_px > DRIFTED_PX if exchanged is None else self.spread_px > SCATTERED_PX
-        return RigState.DRIFTED if self.misfit_deg > DRIFTED_DEG or is_bent else RigState.FITS
+        return RigState.DRIFTED if self.misfit_deg > DRIFTED_DEG or self.left_px > DRIFTED_PX else RigState.FITS
 
     @property
     def turn_deg(self) -> float:
@@ -268,21 +253,20 @@ class RigFinding:
             return f"{self.state}: {self.matches} of {self.tried} points found in both panoramas"
         x, y, z = np.rad2deg(self.drift.turn)
         return (
-            f"{self.state}: columns off by {self.offset_px:+.2f} px (spread {self.spread_px:.2f}), upper "
-            f"camera turned by {self.turn_deg:.3f} deg, sigma {np.rad2deg(self.drift.angle_sigma):.3f} "
+            f"{self.state}: columns off by {self.offset_px:+.2f} px, upper camera "
+            f"turned by {self.turn_deg:.3f} deg, sigma {np.rad2deg(self.drift.angle_sigma):.3f} "
             f"({x:+.3f} {y:+.3f} {z:+.3f}), by {self.matches} points"
         )
 
 
-def judge(found: Matches, cylinder: Cylinder, exchanged_matches: int | None = None) -> RigFinding:
+def judge(found: Matches, cylinder: Cylinder, exchanged_matches: int = 0) -> RigFinding:
     """Return what the matches of some pairs say about their rig.
 
-    exchanged_matches: number of the matches with the cameras exchanged; None: not tried.
+    exchanged_matches: number of the matches with the cameras exchanged; 0 if that was not tried.
     """
     # 1. Offsets of the columns, as they are.
     shifts = cylinder.wrap(found.upper[:, 0] - found.lower[:, 0])
     offset = float(np.median(shifts)) if len(shifts) else float("nan")
-    spread = SIGMA_PER_MAD * float(np.median(np.abs(shifts - offset))) if len(shifts) else float("nan")
     # 2. The rotation and shift of the upper camera that explain them.
     drift = None
     if len(shifts) >= MIN_MATCHES:
@@ -290,7 +274,7 @@ def judge(found: Matches, cylinder: Cylinder, exchanged_matches: int | None = No
     # 3. Residuals in each direction show changed intrinsics.
     offsets = _sector_offsets(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else []
     left_px = float(np.median(offsets)) if offsets else float("nan")
-    return RigFinding(found, exchanged_matches, offset, spread, left_px, drift)
+    return RigFinding(found, exchanged_matches, offset, left_px, drift)
 
 
 def _sector_offsets(lower: Array, shifts: Array, cylinder: Cylinder) -> list[float]:
@@ -298,4 +282,4 @@ def _sector_offsets(lower: Array, shifts: Array, cylinder: Cylinder) -> list[flo
     azimuth = cylinder.azimuth(lower[:, 0])
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     parts = [shifts[sector == k] for k in range(SECTORS)]
-    return [abs(float(np.median(part))) for part in parts if len(part) >= MIN_IN_SECTOR]
+    return [abs(float(np.median(part))) for part in parts if len(part) * SECTORS >= MIN_MATCHES]

@@ -131,7 +131,7 @@ def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
 def test_half_a_degree_is_a_warning(turned: Turned, turn_deg: tuple[float, float, float]) -> None:
     monitor, _ = turned(turn_deg)
     status = entry(RIG, rig_stats(monitor))
-    assert status.level == 1 and status.message.startswith("drifted: ") and monitor.finding and monitor.finding.drift
+    assert status.level == 1 and "drifted" in status.message and monitor.finding and monitor.finding.drift
     assert np.rad2deg(monitor.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
     assert float(status.values["turn_deg"]) == pytest.approx(np.linalg.norm(turn_deg), abs=0.05)
 
@@ -220,7 +220,7 @@ def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(
     for one in exchanged[:4]:
         health.begin(one)
     assert health.state is RigState.EXCHANGED
-    assert health.warning.startswith("after the pose was lost, the images match better the other way round")
+    assert "the other way round" in health.warning
     # 3. It is checked again, a second later, and so found that they are right again.
     for one in pairs[4:12]:
         health.begin(one)
