@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.control.collision_monitor import CollisionSettings, Outline, unknown_ends
+from omnid.core.control.collision_geometry import Outline
+from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
 from omnid.core.navigation.lattice_kernels import HEADINGS, rooms_along, search, wave_front
 from omnid.core.navigation.path import DrivePath, drive_path
 from omnid.core.navigation.settings import NavigationSettings
