@@ -20,7 +20,7 @@ from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
-from omnid.core.navigation.follower import BRAKE_SHARE, LAST_MPS, STAND, TURN_RAD, Follower, Following
+from omnid.core.navigation.follower import BRAKE_SHARE, STAND, TURN_RAD, Follower, Following
 from omnid.core.navigation.path import STEP_M, DrivePath, drive_path
 from omnid.core.navigation.planner import Planner, Surroundings, distances
 from omnid.core.navigation.requests import NavigationFrame
@@ -268,9 +268,8 @@ class Navigator:
         """
         xy = drive.follower.path.xy[drive.follower.ahead(LOOK_M)]
         rooms_m = self._planner.rooms_m(xy, around, around.room, now.stamp_ns)
-        more_m, is_at_rest = 0.0 if drive.avoids else self.settings.clearance_m, abs(now.speed_mps) < 2 * LAST_MPS
-        is_blocked = self._planner.is_blocked(rooms_m, more_m, is_at_rest=is_at_rest)
-        near_m = rooms_m[:, : 1 + round(self.collision.front_m / STEP_M)].min() - self.collision.half_width_m
+        is_blocked = self._planner.is_blocked(rooms_m, 0.0 if drive.avoids else self.settings.clearance_m)
+        near_m = rooms_m[: 1 + round(self.collision.front_m / STEP_M)].min() - self.collision.half_width_m
         return STEP_M * float(np.argmax(is_blocked)) if is_blocked.any() else math.inf, float(near_m)
 
     def _takes_other_way(

@@ -159,24 +159,19 @@ class Planner:
         )
 
     def rooms_m(self, xy: Array, around: Surroundings, room: Array, now_ns: int) -> Array:
-        """Return the room (2, N) of the middle of the base along points (N, 2), beside what rests, and beside all.
-
-        room (N, N): of each cell, in cells.
-        """
+        """Return the room (N,) of the middle of the base along points (N, 2); room (N, N): of each cell, in cells."""
         ways_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T)))
         way = np.column_stack([around.in_cells(xy), ways_m / self._settings.pursuit.velocity_mps])
-        movers = around.movers(now_ns)
-        return CELL_M * np.array([rooms_along(room, some, way) for some in (movers[:0], movers)])
+        return CELL_M * rooms_along(room, around.movers(now_ns), way)
 
-    def is_blocked(self, rooms_m: Array, more_m: float = 0.0, *, is_at_rest: bool = False) -> Flags:
-        """Return where along a way there is less room (2, N) than the base needs, and so much more [m].
+    def is_blocked(self, rooms_m: Array, more_m: float = 0.0) -> Flags:
+        """Return where along a way there is less room (N,) than the base needs, and so much more [m].
 
-        What the base is near to already, and drives away from, does not count; where the base is at rest, and somebody
-        moves near it, it does.
+        What it is near to already, and drives away from, does not count.
         """
-        least_m, near_m = self.room_m + more_m, rooms_m[0 if is_at_rest else 1]
-        leaves = np.logical_and.accumulate((near_m < least_m) & np.append(True, np.diff(near_m) > -0.1 * CELL_M))
-        return np.asarray((rooms_m[1] < least_m) & ~leaves)
+        is_near = rooms_m < self.room_m + more_m
+        leaves = np.logical_and.accumulate(is_near & np.append(True, np.diff(rooms_m) > -0.1 * CELL_M))
+        return np.asarray(is_near & ~leaves)
 
     def way(
         self,
