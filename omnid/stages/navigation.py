@@ -17,7 +17,7 @@ from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path
-from omnid.core.navigation.planner import Surroundings, near_ends
+from omnid.core.navigation.planner import Surroundings
 from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
@@ -73,7 +73,7 @@ class NavigationStage:
         """collision: the outline of the base. map_name: of the map's file; empty: the map is not saved, so no route can
         be tied to it. is_new: the map was empty before this run, and its frame is odom at the start.
         """
-        self._settings, self._collision, self._T_base_rig = settings, collision, T_base_rig
+        self._settings, self._T_base_rig = settings, T_base_rig
         self._T_rig_base = se3.inverse(T_base_rig)
         self._T_base_rect, self._T_rect_base = T_base_rect, se3.inverse(T_base_rect)
         self.map_name, self._is_new = map_name, is_new
@@ -145,9 +145,7 @@ class NavigationStage:
         if self._navigator.drive is None or scan is None or scan.grid is None or not is_young:
             return None
         if before is None or before.stamp_ns != scan.stamp_ns:
-            pose = planar(scan.T_odom_base)
-            ends = near_ends(pose, scan.ranges_m, scan.free_m, self._collision)
-            self._around = Surroundings(scan.grid, scan.moving, scan.stamp_ns, pose, before, ends)
+            self._around = Surroundings(scan.grid, scan.moving, scan.stamp_ns, planar(scan.T_odom_base), before)
         return self._around
 
     def _place(self, update: PlaceUpdate) -> None:

@@ -76,7 +76,7 @@ def rooms_along(room: Doubles, movers: Doubles, way: Doubles) -> Doubles:
 
 
 @compiled(
-    "(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, f8, i8)", writes=()
+    "(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, f8)", writes=()
 )
 def search(
     room: Doubles,
@@ -90,7 +90,6 @@ def search(
     change_s: float,
     done_s: float,
     end_rad: float,
-    barred: int,
 ) -> Doubles:
     """Return the fastest way (K, 6) from a pose to where no time is left, empty without one. Last column: its moves.
 
@@ -98,7 +97,7 @@ def search(
     start (3,): x, y, heading. moves (M, 3): signed way, turn [rad], least time. discs (3, D): centres ahead of the
     origin of the discs that cover what must be free in a move ahead, back, and on the spot. movers: as in `room_at`.
     radius: of the discs. change_s: time of a change between these. done_s: time left that counts as none. end_rad:
-    heading at the end, NaN for any. barred: row of the discs whose move cannot be the first one, -1: none.
+    heading at the end, NaN for any.
     """
     size = len(room)
     nodes = np.empty((MOST_NODES, 6))  # x, y, heading, time, node before, move from there
@@ -123,9 +122,6 @@ def search(
         # 2. All moves from here.
         for k in range(len(moves)):
             along, turn, least_s = moves[k]
-            kind = 0 if along > 0 else 1 if along < 0 else 2
-            if node == 0 and kind == barred:
-                continue
             middle = heading + 0.5 * turn
             to_x, to_y, to_heading = x + along * math.cos(middle), y + along * math.sin(middle), heading + turn
             r, c = round(to_y), round(to_x)
@@ -139,7 +135,7 @@ def search(
                 continue
             # 3. The room of the base there; where it begins too near to something, it may get no nearer.
             is_free = True
-            for disc in discs[kind]:
+            for disc in discs[0 if along > 0 else 1 if along < 0 else 2]:
                 there_x, there_y = to_x + disc * math.cos(to_heading), to_y + disc * math.sin(to_heading)
                 there = room_at(room, movers, there_x, there_y, there_s)
                 if there < radius:

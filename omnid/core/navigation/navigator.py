@@ -22,7 +22,7 @@ from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.follower import BRAKE_SHARE, STAND, TURN_RAD, Follower, Following
 from omnid.core.navigation.path import STEP_M, DrivePath, drive_path
-from omnid.core.navigation.planner import Planner, Surroundings, distances
+from omnid.core.navigation.planner import Planner, Surroundings
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation, refusal_of_map, refusal_to_drive
@@ -31,14 +31,14 @@ from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-# Length of the way ahead that must be free; twice that is searched for a free place behind. After progress of half of
-# it the next block is a new one.
-LOOK_M: Final = 2.0
+LOOK_M: Final = 2.0  # Length of the way ahead that must be free; twice that is searched for a free place behind.
+REJOIN: Final = 6  # Free points of the path behind an obstacle, at the last of which a way around it ends.
 # Time between two searches for a way while the present one is blocked, and for a shorter one while it is free.
 AGAIN_S, SHORTER_S = 0.5, 2.0
 BETTER: Final = 0.8  # A way replaces one that is free only if it is shorter than this share of it.
-MOST_WAYS: Final = 6  # Most ways that are tried without coming LOOK_M / 2 nearer to the end.
+MOST_WAYS: Final = 6  # Most ways that are tried without coming NEARER_M nearer to the end.
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
+NEARER_M: Final = 1.0  # After this progress the next block is a new one.
 
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 WAITS: Final = "it goes on by itself when the way is free"
@@ -65,11 +65,12 @@ class Drive:
     unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
     localised_ns: int = -1  # stamp of that pose
     stuck_s: float = 0.0  # time since the last progress
-    # Since the way that was left was shorter by LOOK_M / 2 for the last time:
+    # Since the way that was left was shorter by NEARER_M for the last time:
     least_m: float = math.inf  # that length
     blocked_s: float = 0.0  # time for which no way was free
     around_s: float = 0.0  # time on ways around something
     ways: int = 0  # number of these ways
+    barred: list[Array] = field(default_factory=list)  # points (N, 2) in odom where the collision monitor stopped it
     searched_s: float = -math.inf  # stamp of the last search
     no_way: str = ""  # why that search found none
 
@@ -172,20 +173,19 @@ class Navigator:
         following = drive.follower.step(*motion)
         around, setpoint, held_by = now.around, following.setpoint, now.wheels.held_by
         if around is not None and not drive.follower.aligns and not following.done:
-            free_m, near_m = self._free_m(drive, now, around)
+            free_m = self._free_m(drive, now, around)
             if self._takes_other_way(drive, now, around, following, is_blocked=free_m < LOOK_M or bool(held_by)):
                 following, held_by = drive.follower.step(*motion), ""
-                free_m, near_m = self._free_m(drive, now, around)
-            # Near obstacles it is slower; without another way it drives up to the obstacle.
-            pursuit, wanted = settings.pursuit, following.setpoint
+                free_m = self._free_m(drive, now, around)
+            # Without one, drive up to the obstacle.
             left_m = free_m - self.collision.front_m - 2 * self.collision.stop_m
-            braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
-            near_mps = max(pursuit.velocity_mps * near_m / pursuit.slow_obstacle_m, pursuit.least_mps)
-            highest_mps = near_mps if wanted.velocity_mps < 0 else min(near_mps, braking_mps)
-            share = min(1.0, highest_mps / abs(wanted.velocity_mps)) if wanted.velocity_mps else 1.0
-            setpoint = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
-            if wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps:
-                setpoint, reason = STAND, CROSSES if around.moves else OBSTACLE
+            braking_mps = math.sqrt(2 * BRAKE_SHARE * settings.pursuit.acceleration_mps2 * max(left_m, 0.0))
+            setpoint = following.setpoint
+            if setpoint.velocity_mps > braking_mps:
+                share = braking_mps / setpoint.velocity_mps
+                setpoint = Setpoint(braking_mps, setpoint.heading_rad, share * setpoint.yaw_rate_radps)
+                if braking_mps < settings.pursuit.least_mps:
+                    setpoint, reason = STAND, CROSSES if around.moves else OBSTACLE
         # 3. The end of the path.
         if following.done:
             return self._finished(drive, following.left_m)
@@ -196,8 +196,9 @@ class Navigator:
             )
         # 4. Blocked: it waits, also where a safety rule holds the wheels, which lets go by itself. A goal to which no
         #    way leads fails after a time; paths and routes wait.
-        if following.left_m < drive.least_m - LOOK_M / 2:
+        if following.left_m < drive.least_m - NEARER_M:
             drive.least_m, drive.ways, drive.blocked_s, drive.around_s = following.left_m, 0, 0.0, 0.0
+            drive.barred.clear()
         drive.around_s += dt_s if drive.avoids else 0.0
         progress = following.left_m, following.offset_m
         if reason or held_by:
@@ -261,16 +262,12 @@ class Navigator:
             return NavigationState.PAUSED, f"{wheels.source} drives: it goes on when that ends"
         return NavigationState.DRIVING, ""
 
-    def _free_m(self, drive: Drive, now: Situation, around: Surroundings) -> tuple[float, float]:
-        """Return the length of the way ahead that is free, up to LOOK_M, and the room beside the base just ahead [m].
-
-        On a path, it keeps the clearance to obstacles.
-        """
+    def _free_m(self, drive: Drive, now: Situation, around: Surroundings) -> float:
+        """Return the length of the way ahead that is free, up to LOOK_M; on a path with the clearance to obstacles."""
+        more_m = 0.0 if drive.avoids else self.settings.clearance_m
         xy = drive.follower.path.xy[drive.follower.ahead(LOOK_M)]
-        rooms_m = self._planner.rooms_m(xy, around, around.room, now.stamp_ns)
-        is_blocked = self._planner.is_blocked(rooms_m, 0.0 if drive.avoids else self.settings.clearance_m)
-        near_m = rooms_m[: 1 + round(self.collision.front_m / STEP_M)].min() - self.collision.half_width_m
-        return STEP_M * float(np.argmax(is_blocked)) if is_blocked.any() else math.inf, float(near_m)
+        is_blocked = self._planner.is_blocked(xy, around, around.room, now.stamp_ns, more_m)
+        return STEP_M * float(np.argmax(is_blocked)) if is_blocked.any() else math.inf
 
     def _takes_other_way(
         self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_blocked: bool
@@ -282,44 +279,46 @@ class Navigator:
         # 1. Straight on to a goal, where that is free, with a cell to spare.
         if way.is_goal and not is_blocked:
             straight = drive_path([here, goal], way.final_heading_rad, is_goal=True)
-            is_ahead = abs(wrap_angle(straight.heading[0] - now.pose[2])) < TURN_RAD
-            seen, more_m = np.minimum(around.room, distances(around.is_unknown)), settings.clearance_m + STEP_M
-            rooms_m = self._planner.rooms_m(straight.xy, around, seen, now.stamp_ns)
-            if is_ahead and not self._planner.is_blocked(rooms_m, more_m).any():
+            is_ahead, more_m = (
+                abs(wrap_angle(straight.heading[0] - now.pose[2])) < TURN_RAD,
+                settings.clearance_m + STEP_M,
+            )
+            blocked = self._planner.is_blocked(straight.xy, around, around.seen_room, now.stamp_ns, more_m)
+            if is_ahead and not blocked.any():
                 drive.drive_along(straight, settings, now.speed_mps, 0.0)
                 return True
         if now.stamp_ns * 1e-9 - drive.searched_s < (AGAIN_S if is_blocked else SHORTER_S):
             return False
         drive.searched_s = now.stamp_ns * 1e-9
-        # 2. A way to the goal, or to the first free place on the path behind its obstacle. Where the collision monitor
-        #    has stopped the base, it begins with another move.
-        barred, v = -1, following.setpoint.velocity_mps
+        # 2. Where the collision monitor has stopped the base, the way is closed, although the grid shows it free.
         if now.wheels.held_by:
-            barred = 0 if v > 0 else 1 if v < 0 else 2
-        along, heading_rad, join = None, math.nan, len(way.s)
+            outline, v = self.collision, following.setpoint.velocity_mps
+            ahead_m = math.copysign((outline.front_m if v > 0 else outline.rear_m) + outline.stop_m, v) if v else 0.0
+            beside_m = outline.half_width_m if v else math.hypot(outline.front_m, outline.half_width_m)
+            places = np.array([[ahead_m, beside_m, 0.0], [ahead_m, -beside_m, 0.0]])
+            drive.barred.append(composed(now.pose[None], places)[:, :2])
+        # 3. A way to the goal, or to the first free place on the path behind its obstacle.
+        along, heading_rad, join, room = None, math.nan, len(way.s), around.room_with(drive.barred)
         if not way.is_goal:
             ahead = drive.follower.ahead(2 * LOOK_M, drive.around_m)
-            room = around.room if barred < 0 else around.closed
-            rooms_m = self._planner.rooms_m(way.xy[ahead], around, room, now.stamp_ns)
-            is_closed = self._planner.is_blocked(rooms_m, settings.clearance_m)
+            is_closed = self._planner.is_blocked(way.xy[ahead], around, room, now.stamp_ns, settings.clearance_m)
             after = int(np.argmax(is_closed))
-            count = math.ceil(self._planner.room_m / STEP_M)  # free points, at the last of which the way ends
-            runs = sliding_window_view(np.append(~is_closed, np.ones(count, bool)), count + 1)
+            runs = sliding_window_view(np.append(~is_closed, np.ones(REJOIN, bool)), REJOIN + 1)
             is_run = np.asarray(runs.all(axis=1))[after:]
             if not is_run.any():
                 drive.no_way = "the path is not free within sight"
                 return False
-            join = ahead.start + min(after + int(np.argmax(is_run)) + count, len(is_closed) - 1)
+            join = ahead.start + min(after + int(np.argmax(is_run)) + REJOIN, len(is_closed) - 1)
             goal = way.xy[join]
             along = drive.paths[0].moved(drive.T_odom_frame).xy
             heading_rad = way.heading[join] + math.pi * (way.speed[join] < 0)
-        found = self._planner.way(now.pose, goal, around, now.stamp_ns, along, heading_rad, barred)
+        found = self._planner.way(now.pose, goal, around, room, now.stamp_ns, along, heading_rad)
         if isinstance(found, DrivePath) and is_blocked and drive.ways >= MOST_WAYS:
             found = f"{drive.ways} ways were tried"
         drive.no_way = found if isinstance(found, str) else ""
         if isinstance(found, str) or (not is_blocked and found.length_m > BETTER * following.left_m):
             return False
-        # 3. Follow it, and then the rest of the path.
+        # 4. Follow it, and then the rest of the path.
         drive.ways += is_blocked
         xy, speeds = np.vstack([found.xy, way.xy[join:]]), np.append(found.speed, way.speed[join:])
         joined = drive_path(xy, way.final_heading_rad, speeds=speeds, is_goal=way.is_goal)

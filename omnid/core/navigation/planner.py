@@ -17,24 +17,23 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.control.collision_geometry import Outline
-from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
+from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.navigation.lattice_kernels import HEADINGS, rooms_along, search, wave_front
 from omnid.core.navigation.path import DrivePath, drive_path
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.obstacles.grid import CELL_M, OCCUPIED, UNKNOWN, FloorGrid
+from omnid.core.obstacles.grid import CELL_M, FREE, OCCUPIED, UNKNOWN, FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Ranges = NDArray[np.floating]
 
 MOVE_CELLS: Final = 3  # length of an arc, so that it leaves its cell in any direction
 BACK_MPS: Final = 0.2  # slower than forwards, because people do not expect a robot to back up
 UNKNOWN_COST: Final = 4.0  # A detour over floor that was seen is preferred up to so many times as far.
 NEAR_M: Final = 1.2  # Floor nearer than that would be seen if it could be.
 TRAIL_S: Final = 0.5  # The grid shows what moves where it was for this time, because pairs vote.
-SIGMA_M: Final = 0.2  # uncertainty of what moves: so far beyond its radius cells are its own, and no way leads
+OWN_M: Final = 0.25  # beyond its radius, cells are those of what moves
+SIGMA_M: Final = 0.2  # room for the uncertainty of what moves
 SPECK: Final = np.ones((3, 3), np.uint8)  # unknown floor that is smaller stops no base
 
 
@@ -48,31 +47,28 @@ class Surroundings:
         stamp_ns: int = 0,
         pose: Array | None = None,
         before: Surroundings | None = None,
-        ends: Array | None = None,
     ) -> None:
-        """stamp_ns, pose (3,): of the pair. before: surroundings of an earlier pair, in the same odom.
-
-        ends (N, 2): where near ways end, by `near_ends`.
-        """
+        """stamp_ns, pose (3,): of the pair. before: surroundings of an earlier pair, in the same odom."""
         self.grid, self.stamp_ns, states = grid, stamp_ns, grid.states
         self._movers = np.array([(m.x_m, m.y_m, m.vx_mps, m.vy_mps, m.radius_m) for m in moving]).reshape(-1, 5)
         # 1. Obstacles at rest: what moves is left out, with its trail.
-        is_occupied = states == OCCUPIED
+        is_closed = states == OCCUPIED
         for x, y, vx, vy, radius_m in self._movers:
-            behind_m, middle = 0.5 * TRAIL_S * math.hypot(vx, vy), np.array([x, y]) - 0.5 * TRAIL_S * np.array([vx, vy])
-            is_occupied &= self.away_m(middle) > radius_m + SIGMA_M + behind_m
-        self.room = distances(is_occupied)  # of each cell, in cells
-        # 2. Floor that was not seen although the base came near is closed until it is seen: more views show no more. So
-        #    are places where ways end among cells each of which is free.
+            behind_m = 0.5 * TRAIL_S * math.hypot(vx, vy)
+            is_closed &= (
+                self.away_m(np.array([x, y]) - 0.5 * TRAIL_S * np.array([vx, vy])) > radius_m + OWN_M + behind_m
+            )
+        # 2. Floor that was not seen although the base came near is closed until it is seen: more views show no more.
         is_patch = cv2.morphologyEx((states == UNKNOWN).view(np.uint8), cv2.MORPH_OPEN, SPECK) > 0
-        is_unseen = np.zeros(states.shape, bool) if pose is None else self.away_m(pose) < NEAR_M
+        is_unseen = np.zeros(states.shape, bool)
+        if pose is not None:
+            is_unseen = self.away_m(pose) < NEAR_M
         if before is not None:
             is_unseen |= self.cells(before._unseen)
         is_unseen &= is_patch
         self._unseen: Array = grid.corner_m + CELL_M * (np.argwhere(is_unseen)[:, ::-1] + 0.5)
-        is_end = np.zeros(states.shape, bool) if ends is None else self.cells(ends)
-        self.is_unknown = (states == UNKNOWN) | is_end
-        self.closed = distances(is_occupied | is_unseen | is_end)  # of each cell, in cells
+        self._is_closed = is_closed | is_unseen
+        self.room = distances(self._is_closed)  # of each cell, in cells
 
     @property
     def moves(self) -> bool:
@@ -92,6 +88,17 @@ class Surroundings:
         flags[rows[inside], columns[inside]] = True
         return flags
 
+    @property
+    def seen_room(self) -> Array:
+        """Distance of each cell from what is no floor that was seen [cells]."""
+        return distances(self.grid.states != FREE)
+
+    def room_with(self, barred: Sequence[Array]) -> Array:
+        """Return the room of each cell [cells], where points (N, 2) are closed, too."""
+        if not barred:
+            return self.room
+        return distances(self._is_closed | self.cells(np.concatenate(barred)))
+
     def in_cells(self, points: Array) -> Array:
         """Return points (N, 2) in cells, whose middles are integers."""
         return np.asarray((points - self.grid.corner_m) / CELL_M - 0.5)
@@ -102,26 +109,6 @@ class Surroundings:
         now[:, :2] = self.in_cells(now[:, :2] + (now_ns - self.stamp_ns) * 1e-9 * now[:, 2:4])
         now[:, 2:] = (now[:, 2:] + [0.0, 0.0, SIGMA_M + room_m]) / CELL_M
         return now
-
-
-def near_ends(pose: Array, ranges_m: Ranges, free_m: Ranges, collision: CollisionSettings) -> Array:
-    """Return the places (N, 2) near a pose (3,) where floor in view ends for the collision monitor, without a surface.
-
-    Along a way small probabilities of obstacles add up to more than the risk, though each of its cells may be free.
-    ranges_m, free_m (S,): of a scan from there. collision: the outline, in which nothing ends, and the distance within
-    which an end belongs to a surface, in any direction: along a wall, no ray shows floor up to it.
-    """
-    outline = Outline(collision.front_m, collision.rear_m, collision.half_width_m)
-    ends = unknown_ends(ranges_m.tolist(), free_m.tolist(), collision.stop_m)
-    azimuths = (np.arange(len(ranges_m)) + 0.5) * (math.tau / len(ranges_m)) - math.pi
-    directions = np.column_stack([np.cos(azimuths + pose[2]), np.sin(azimuths + pose[2])])
-    sectors = np.array([end.sector for end in ends], np.intp)
-    edges_m = [outline.edge_m(math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths[sectors]]
-    away_m = np.maximum([end.free_m for end in ends], edges_m)
-    is_seen, places = np.isfinite(ranges_m), away_m[:, None] * directions[sectors]
-    surfaces = ranges_m[is_seen, None] * directions[is_seen]
-    from_surface_m = np.linalg.norm(places[:, None] - surfaces, axis=2).min(axis=1, initial=math.inf)
-    return np.asarray(pose[:2] + places[(away_m < NEAR_M) & (from_surface_m > collision.stop_m)])
 
 
 def distances(flags: Flags) -> Array:
@@ -158,19 +145,16 @@ class Planner:
             + [(0.0, turn, least_s) for turn, least_s in turns]
         )
 
-    def rooms_m(self, xy: Array, around: Surroundings, room: Array, now_ns: int) -> Array:
-        """Return the room (N,) of the middle of the base along points (N, 2); room (N, N): of each cell, in cells."""
+    def is_blocked(self, xy: Array, around: Surroundings, room: Array, now_ns: int, more_m: float = 0.0) -> Flags:
+        """Return where along points (N, 2) the base has less room than it needs, and so much more [m].
+
+        room (N, N): of each cell, in cells. What the base is near to already, and drives away from, does not count.
+        """
         ways_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T)))
         way = np.column_stack([around.in_cells(xy), ways_m / self._settings.pursuit.velocity_mps])
-        return CELL_M * rooms_along(room, around.movers(now_ns), way)
-
-    def is_blocked(self, rooms_m: Array, more_m: float = 0.0) -> Flags:
-        """Return where along a way there is less room (N,) than the base needs, and so much more [m].
-
-        What it is near to already, and drives away from, does not count.
-        """
-        is_near = rooms_m < self.room_m + more_m
-        leaves = np.logical_and.accumulate(is_near & np.append(True, np.diff(rooms_m) > -0.1 * CELL_M))
+        rooms = rooms_along(room, around.movers(now_ns), way)
+        is_near = rooms < (self.room_m + more_m) / CELL_M
+        leaves = np.logical_and.accumulate(is_near & np.append(True, np.diff(rooms) > -0.1))
         return np.asarray(is_near & ~leaves)
 
     def way(
@@ -178,18 +162,17 @@ class Planner:
         pose: Array,
         goal: Array,
         around: Surroundings,
+        room: Array,
         now_ns: int,
         along: Array | None = None,
         heading_rad: float = math.nan,
-        barred: int = -1,
     ) -> DrivePath | str:
         """Return the fastest way from a pose (3,) to a goal (2,), or to the edge of the grid towards it, or why none.
 
         along (M, 2): a path from which the way is not farther than corridor_m; None: it may lead anywhere. heading_rad:
-        at the goal, within a step of the search; NaN: any. barred: the collision monitor has stopped such a move here,
-        so that the way begins with another one (0: ahead, 1: back, 2: a turn). All in odom.
+        at the goal, within a step of the search; NaN: any. All in odom. room (N, N): of each cell, in cells.
         """
-        pursuit, room = self._settings.pursuit, around.closed
+        pursuit = self._settings.pursuit
         at, start = around.in_cells(goal), around.in_cells(pose[:2]).clip(0, len(room) - 1)
         rows, columns = np.indices(room.shape)
         own = np.s_[round(start[1]), round(start[0])]
@@ -197,7 +180,7 @@ class Planner:
         #    base that begins too near to something may leave, as far as it gets no nearer.
         gap = (CELL_M * room - self._half_width_m) / pursuit.slow_obstacle_m
         speed_mps = pursuit.velocity_mps * np.clip(gap, pursuit.least_mps / pursuit.velocity_mps, 1.0)
-        speed_mps[around.is_unknown] /= UNKNOWN_COST
+        speed_mps[around.grid.states == UNKNOWN] /= UNKNOWN_COST
         least = np.full(room.shape, self.room_m / CELL_M)
         least[around.away_m(pose) < self._radius * CELL_M] = min(self.room_m / CELL_M, room[own])
         cell_s = np.where(room < least, np.inf, CELL_M / speed_mps)
@@ -230,7 +213,7 @@ class Planner:
         movers, done_s = around.movers(now_ns, self._settings.clearance_m), MOVE_CELLS * CELL_M / pursuit.velocity_mps
         change_s, of_base = pursuit.velocity_mps / pursuit.acceleration_mps2, np.append(start, pose[2])
         tables = of_base, self._moves, self._discs, movers, self._radius
-        found = search(room, cell_s, left_s, *tables, change_s, done_s, heading_rad, barred)
+        found = search(room, cell_s, left_s, *tables, change_s, done_s, heading_rad)
         # 4. Its points; turns on the spot are the corners of a path.
         cells = self._moves[found[1:, 5].astype(int), 0]
         xy, cells = around.grid.corner_m + CELL_M * (found[1:, :2][cells != 0] + 0.5), cells[cells != 0]

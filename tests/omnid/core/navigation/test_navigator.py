@@ -15,9 +15,9 @@ from omnid.core.navigation.navigator import STOPS, WAITS, Navigation, Navigator
 from omnid.core.navigation.path import drive_path
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import WheelState
+from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.navigation_state import NavigationState
-from omnid.tracking_state import TrackingState
+from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
@@ -189,6 +189,34 @@ def test_a_stop_between_two_poses_ends_a_drive_although_it_is_armed_again(
         assert not base.navigator.resume(base.seen()._replace(wheels=armed))
         now = base.seen()._replace(wheels=armed)
         assert base.navigator.step(now).state is NavigationState.DRIVING, "a person resumed it"
+
+
+@pytest.mark.parametrize(
+    ("change", "frame", "words"),
+    [
+        ({"wheels": WheelState(False, True, "not armed since the start")}, "odom", "omnid arm"),
+        ({"state": TrackingState.LOST}, "odom", "odometry is lost"),
+        ({"in_map": None}, "map", "not localised"),
+        ({"in_map": MapPosition(np.zeros(3), MapState.ODOMETRY_ONLY, 0.01)}, "map", "not localised"),
+        ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, 0.5)}, "map", "uncertain by 0.50 m"),
+        ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, math.nan)}, "map", "uncertain"),
+        ({"in_map": None}, "odom", ""),
+    ],
+)
+def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: str) -> None:
+    now = Situation(
+        0,
+        np.zeros(3),
+        0.0,
+        0.0,
+        TrackingState.TRACKING,
+        0,
+        WheelState(True, False),
+        MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02),
+    )._replace(**change)  # type: ignore[arg-type]
+    refusal = refusal_to_drive(now, NavigationFrame(frame), 0.3)
+    assert words in refusal and bool(refusal) == bool(words) and "\n" not in refusal
+    assert "no pose" in refusal_to_drive(None, NavigationFrame(frame), 0.3)
 
 
 GOAL_M, GOAL_RAD = 0.03, math.radians(1)

@@ -14,7 +14,7 @@ from calib.se2_arrays import relative
 from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings, ControllerScan, MovingPoint
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import drive_path
-from omnid.core.navigation.planner import Surroundings, near_ends
+from omnid.core.navigation.planner import Surroundings
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
@@ -91,8 +91,10 @@ def clearance_m(base: BaseAmongBoxes) -> float:
     "boxes",
     [
         Boxes((2.5, -0.2, 2.9, 0.2)),
+        Boxes((2.5, -1.2, 2.8, 0.1)),
         Boxes((2.5, -0.1, 2.8, 1.2)),
         Boxes((1.6, -0.6, 1.8, 0.3), (3.2, -0.3, 3.4, 0.6)),
+        Boxes((2.0, -0.15, 3.2, 0.15)),
         Boxes((2.4, -0.2, 2.8, 0.2), (-1.0, 1.2, 7.0, 1.4), (-1.0, -1.4, 7.0, -1.2)),
     ],
 )
@@ -130,6 +132,13 @@ def test_goes_on_when_the_way_becomes_free() -> None:
     base.run(60, lambda answer: answer.state is NavigationState.BLOCKED)
     base.boxes = Boxes()
     assert base.run(60).state is NavigationState.REACHED
+
+
+def test_without_a_corridor_it_stays_on_the_path() -> None:
+    base = drive(Boxes((2.5, -0.2, 2.9, 0.2)), 3, NavigationSettings(corridor_m=0.0))
+    base.run(60, lambda answer: answer.state is NavigationState.BLOCKED, rest_s=20.0)
+    assert base.samples[-1].navigation.state is NavigationState.BLOCKED
+    assert max(abs(float(sample.pose[1])) for sample in base.samples) < 0.1
 
 
 def test_walls_beside_the_path_change_nothing() -> None:
@@ -265,7 +274,7 @@ def test_a_person_who_crosses_is_let_pass_without_contact() -> None:
 
 
 @pytest.mark.hazard("H18")
-@pytest.mark.parametrize(("at_m", "begins_s"), [(4.6, 0.5), (3.4, 2.6), (1.2, 5.0)])
+@pytest.mark.parametrize(("at_m", "begins_s"), [(4.6, 0.5), (3.4, 2.6), (3.4, 3.8), (1.2, 5.0)])
 def test_who_has_passed_before_or_comes_after_costs_little_time(at_m: float, begins_s: float) -> None:
     base = BaseAmongPeople(4, (at_m, 1.9), (0.0, -0.9), begins_s)
     assert base.run(60).state is NavigationState.REACHED
@@ -286,6 +295,12 @@ def test_stands_when_a_person_walks_into_it() -> None:
     base = BaseAmongPeople(5, (7.0, 0.0), (-0.7, 0.0), 1.0)
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m < 0 and base.contact_mps < 0.02
+
+
+def test_follows_a_person_who_walks_ahead_more_slowly() -> None:
+    base = BaseAmongPeople(6, (1.3, 0.0), (0.25, 0.0), 0.0)
+    assert base.run(60).state is NavigationState.REACHED
+    assert base.gap_m > 0.1
 
 
 SEEN_M = 2.0  # Floor is seen so far.
@@ -317,8 +332,7 @@ class BaseAmongPatches(DrivenBase):
         self.law.take(ControllerScan(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
         grid = self.floor.grid(self.pose, ranges_m, free_m)
         grid.occupied[np.isnan(grid.occupied)] = self.occupied
-        ends = near_ends(self.pose, ranges_m, free_m, OUTLINE)
-        self.around = Surroundings(grid, (), now.stamp_ns, self.pose, self.around, ends)
+        self.around = Surroundings(grid, (), now.stamp_ns, self.pose, self.around)
         return now._replace(around=self.around)
 
 
