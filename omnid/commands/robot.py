@@ -141,14 +141,17 @@ def teach(args: argparse.Namespace) -> int:
 def repeat(args: argparse.Namespace) -> int:
     """Repeat a route, from where the robot is on it; exit code 1: its end was not reached, 2: it refuses.
 
-    --reverse           from its end to its start
-    --loops N=1 1..9999  a closed route is driven in rounds, another there and back, N times in all
+    --reverse               from its end to its start
+    --loops N=1 1..10000    a closed route is driven in rounds, another there and back, N times in all
+    --from here|start=here  here: from where the robot is on the route, anywhere within 1.5 m of it; start: the whole
+        route, refused elsewhere
 
     examples:
       route repeat morning
       route repeat morning --reverse --loops 5 --no-wait
     """
-    text = " ".join(["repeat", route_name(args.name), *(["reverse"] if args.reverse else []), f"loops={args.loops}"])
+    words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
+    text = " ".join([*words, f"loops={args.loops}", f"from={vars(args)['from']}"])
     return _drive(args, lambda driver: driver.route(text))
 
 

@@ -16,8 +16,7 @@ from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
-from omnid.core.navigation.path import DrivePath, drive_path
-from omnid.core.navigation.planner import Surroundings
+from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
@@ -33,6 +32,7 @@ from omnid.core.navigation.requests import (
 from omnid.core.navigation.route import ENTRY_M, KeyframePose, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.surroundings import Surroundings, near_ends
 from omnid.errors import OmnidError
 from omnid.messages import (
     MapKeyframes,
@@ -73,7 +73,7 @@ class NavigationStage:
         """collision: the outline of the base. map_name: of the map's file; empty: the map is not saved, so no route can
         be tied to it. is_new: the map was empty before this run, and its frame is odom at the start.
         """
-        self._settings, self._T_base_rig = settings, T_base_rig
+        self._settings, self._collision, self._T_base_rig = settings, collision, T_base_rig
         self._T_rig_base = se3.inverse(T_base_rig)
         self._T_base_rect, self._T_rect_base = T_base_rect, se3.inverse(T_base_rect)
         self.map_name, self._is_new = map_name, is_new
@@ -145,7 +145,9 @@ class NavigationStage:
         if self._navigator.drive is None or scan is None or scan.grid is None or not is_young:
             return None
         if before is None or before.stamp_ns != scan.stamp_ns:
-            self._around = Surroundings(scan.grid, scan.moving, scan.stamp_ns, planar(scan.T_odom_base), before)
+            pose = planar(scan.T_odom_base)
+            ends = near_ends(pose, scan.ranges_m, scan.free_m, self._collision)
+            self._around = Surroundings(scan.grid, scan.moving, scan.stamp_ns, pose, before, ends)
         return self._around
 
     def _place(self, update: PlaceUpdate) -> None:
@@ -216,12 +218,13 @@ class NavigationStage:
     def _start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], command: NavigationCommand) -> None:
         self._navigator.start(task, frame, paths, self._situation(), command.stamp_ns)
         self._begun = max(self._begun, command.id)
-        self._plan = NavigationPlan(frame, paths[0].xy, paths[0].final_heading_rad)
+        xy = np.vstack([leg.xy for leg in paths[0].legs])
+        self._plan = NavigationPlan(frame, xy, paths[0].final_heading_rad)
 
     def _goal_path(self, goal: GoalRequest) -> DrivePath:
         pose = self._pose_in(goal.frame)
         self._require_near(math.dist(pose[:2], (goal.x_m, goal.y_m)))
-        return drive_path(np.array([pose[:2], (goal.x_m, goal.y_m)]), goal.heading_rad, is_goal=True)
+        return goal_path(pose, (goal.x_m, goal.y_m), goal.heading_rad)
 
     def _given_path(self, path: PathRequest) -> DrivePath:
         pose = self._pose_in(path.frame)
@@ -251,6 +254,7 @@ class NavigationStage:
             self._pose_in(NavigationFrame.MAP),
             loops=request.loops,
             reverse=request.reverse,
+            from_start=request.from_start,
         )
 
     def _teach(self, request: RouteRequest) -> None:

@@ -1,18 +1,18 @@
 """State machine of the navigation: from requests and poses to setpoints, with the reason for each stop.
 
-Every end is a stop. Time is that of the poses. A drive in the frame map follows the corrections of the map. At each
-pose there is one decision: the base follows its way, which is the path that was asked for; where that is not free,
-the planner searches another one, to the goal or back to the path; while there is none, the base waits.
+Every end is a stop. Time is that of the poses. A drive in the frame map follows the corrections of the map. The base
+drives straight to a goal, or along a path, while that is free; else by a way of the planner, to the goal or back to the
+path. A moving object is an obstacle where the base would meet it. While no way is free, the base waits.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative
@@ -20,30 +20,44 @@ from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
-from omnid.core.navigation.follower import BRAKE_SHARE, STAND, TURN_RAD, Follower, Following
-from omnid.core.navigation.path import STEP_M, DrivePath, drive_path
-from omnid.core.navigation.planner import Planner, Surroundings
+from omnid.core.navigation.follower import BRAKE_SHARE, STAND, Follower, Following
+from omnid.core.navigation.path import SHORTEST_M, DrivePath, goal_path
+from omnid.core.navigation.planner import Move, Planner
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.situation import UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.surroundings import Surroundings
 from omnid.navigation_state import NavigationState
-from omnid.tracking_state import TrackingState
+from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
-LOOK_M: Final = 2.0  # Length of the way ahead that must be free; twice that is searched for a free place behind.
-REJOIN: Final = 6  # Free points of the path behind an obstacle, at the last of which a way around it ends.
-# Time between two searches for a way while the present one is blocked, and for a shorter one while it is free.
-AGAIN_S, SHORTER_S = 0.5, 2.0
-BETTER: Final = 0.8  # A way replaces one that is free only if it is shorter than this share of it.
-MOST_WAYS: Final = 6  # Most ways that are tried without coming NEARER_M nearer to the end.
+PROGRESS_M, PROGRESS_RAD = SHORTEST_M / 2, math.radians(5)  # A smaller motion is no progress.
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
+LOOK_M: Final = 2.0  # Length of the way ahead that is searched for obstacles; twice that for a free place behind them.
+REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a detour ends.
+# Time between two searches for a way while the present one is blocked, and for a shorter one while it is free.
+AGAIN_NS, SHORTER_NS = 500_000_000, 2_000_000_000
+DOCK_M: Final = 0.5  # The last way to a goal is driven straight on.
+BETTER: Final = 0.8  # A way replaces one that is free only if it takes less than this share of its time.
+MOST_WAYS: Final = 6  # Most ways that are tried without coming NEARER_M nearer to the end.
+LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
 NEARER_M: Final = 1.0  # After this progress the next block is a new one.
 
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
+AROUND: Final = "it looks for a way around an obstacle"
 WAITS: Final = "it goes on by itself when the way is free"
-OBSTACLE: Final = "an obstacle is on the path"
+STANDS: Final = "something stands on the path"
 CROSSES: Final = "somebody or something crosses the path"
+
+
+class Detour(NamedTuple):
+    """A way of the planner, to the goal or back to the path."""
+
+    follower: Follower  # in odom
+    time_s: float  # for all of it
+    leg: int = 0  # of the path, to which it leads back
+    s_m: float = 0.0  # on that leg
 
 
 @dataclass(slots=True)
@@ -53,35 +67,78 @@ class Drive:
     task: str  # description in words
     frame: NavigationFrame
     paths: list[DrivePath]  # paths that are driven one after the other
-    follower: Follower  # of the first of them, or of a way around something that leads to its end
+    follower: Follower  # of the first of them
     resets: int
     stop_count: int  # WheelState.stop_count at the start, or when a person resumed it
-    pose: Array  # (3,) last one in odom
-    T_odom_frame: Array  # (3,) by which the way of the follower is in odom
-    moved_from: Array  # (3,) pose in odom at the last progress
-    around_m: float = 0.0  # length of the way that is not of the path
+    heading_rad: float  # heading at the last progress
+    xy: Array  # last position in odom
+    detour: Detour | None = None  # None: it follows the path
     paused: str = ""  # reason of the pause; empty: it is not paused
     waited_s: float = 0.0  # for the pose in the map
     unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
     localised_ns: int = -1  # stamp of that pose
+    nearest_m: float = math.inf  # length of the way that was left at the last progress
     stuck_s: float = 0.0  # time since the last progress
-    # Since the way that was left was shorter by NEARER_M for the last time:
-    least_m: float = math.inf  # that length
-    blocked_s: float = 0.0  # time for which no way was free
-    around_s: float = 0.0  # time on ways around something
-    ways: int = 0  # number of these ways
-    barred: list[Array] = field(default_factory=list)  # points (N, 2) in odom where the collision monitor stopped it
-    searched_s: float = -math.inf  # stamp of the last search
+    least_m: float = math.inf  # least length of the way that was left, in steps of NEARER_M
+    lost_s: float = 0.0  # time since then for which no way was free
+    tried_s: float = 0.0  # time since then on ways that were blocked again
+    way_s: float = 0.0  # time on the present way
+    ways: int = 0  # number of ways that were begun since then
+    searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why that search found none
+    is_waiting: bool = False  # a way around is known that takes longer than what it has waited is worth
 
     @property
-    def avoids(self) -> bool:
-        """True while it is off the path, around something."""
-        return max(self.follower.s_m, 0.0) < self.around_m
+    def on_way(self) -> Follower:
+        """Follower of the detour or the path."""
+        return self.follower if self.detour is None else self.detour.follower
 
-    def drive_along(self, way: DrivePath, settings: NavigationSettings, speed_mps: float, around_m: float) -> None:
-        """Follow a way in odom; around_m: length of it that is not of the path."""
-        self.follower, self.around_m = Follower(way, settings, speed_mps), around_m
+    def in_odom(self, xy: Array, now: Situation) -> Array:
+        """Return points (N, 2) of the path in odom."""
+        T_odom_frame = relative(now.T_frame_odom(self.frame), np.zeros(3))
+        path = composed(np.repeat(T_odom_frame[None], len(xy), 0), np.column_stack([xy, np.zeros(len(xy))]))
+        return np.asarray(path[:, :2])
+
+    def ahead(self, now: Situation, way_m: float) -> Array:
+        """Return the points (N, 2) of the way ahead, in odom."""
+        xy = self.on_way.ahead(way_m).xy
+        return xy if self.detour is not None else self.in_odom(xy, now)
+
+    def step(self, now: Situation, room_m: float) -> Following:
+        """Return the motion along the path or the detour, in odom; at its end the path goes on."""
+        motion = now.speed_mps, now.yaw_rate_radps, room_m
+        if self.detour is not None:
+            following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
+            if not following.done and following.left_m >= SHORTEST_M:
+                return following
+            self.rejoin(now)
+        following = self.follower.step(now.stamp_ns, now.pose_in(self.frame), *motion)
+        heading_rad = following.setpoint.heading_rad
+        if heading_rad is None:
+            return following
+        turned_rad = float(now.T_frame_odom(self.frame)[2])
+        setpoint = replace(following.setpoint, heading_rad=wrap_angle(heading_rad - turned_rad))
+        return following._replace(setpoint=setpoint)
+
+    def begin_detour(self, detour: Detour) -> None:
+        """Begin a detour."""
+        self.detour, self.nearest_m, self.way_s = detour, math.inf, 0.0
+
+    def rejoin(self, now: Situation) -> None:
+        """Follow the path again, from the place to which the detour leads; to a goal straight on."""
+        path, detour = self.paths[0], self.detour
+        leg, s_m = (0, 0.0) if detour is None else (detour.leg, detour.s_m)
+        if path.is_goal:
+            path, leg, s_m = goal_path(now.pose_in(self.frame), path.goal, path.final_heading_rad), 0, 0.0
+        self.detour, self.nearest_m = None, math.inf
+        self.follower = Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
+
+    def advance(self, now: Situation, left_m: float, dt_s: float) -> None:
+        """Count the time since the last progress, a shorter way to go or a turn, and the time on this way."""
+        turned_rad = abs(wrap_angle(float(now.pose[2]) - self.heading_rad))
+        self.stuck_s, self.way_s = self.stuck_s + dt_s, self.way_s + dt_s
+        if left_m < self.nearest_m - PROGRESS_M or turned_rad > PROGRESS_RAD:
+            self.nearest_m, self.heading_rad, self.stuck_s = left_m, float(now.pose[2]), 0.0
 
 
 class Navigation(NamedTuple):
@@ -92,6 +149,62 @@ class Navigation(NamedTuple):
     reason: str
     left_m: float = math.nan  # way to the end of the path
     offset_m: float = math.nan  # distance of the base to the left of the path
+
+
+class Rule(NamedTuple):
+    """A reason to stop or to end a drive."""
+
+    state: NavigationState
+    words: Callable[[Drive, Situation, NavigationSettings], str]  # empty: it does not hold
+
+
+def _stopped(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    return ASKED if _fault(drive, now) == ASKED else ""
+
+
+def _fault(drive: Drive, now: Situation) -> str:
+    """Return the stop or fault that has disarmed the wheels, also if they were armed again since; empty without one."""
+    wheels = now.wheels
+    if wheels.stop_count != drive.stop_count:
+        return wheels.stopped_by
+    return wheels.disarmed_by if wheels.needs_request else ""
+
+
+def _new_odom(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    is_lost = drive.resets != now.resets and drive.frame is NavigationFrame.ODOM
+    return "odometry has lost its map and begun again: ask again" if is_lost else ""
+
+
+def _paused(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    fault = _fault(drive, now)
+    drive.paused = f"disarmed: {fault}: see to it, then {RESUME}" if fault else drive.paused
+    return drive.paused
+
+
+def _lost(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    return "odometry is lost" if now.state is TrackingState.LOST else ""
+
+
+def _not_in_map(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    if drive.frame is NavigationFrame.ODOM or drive.unlocalised_m <= settings.unlocalised_m:
+        return ""
+    return refusal_of_map(now, settings.map_sigma_m).partition(":")[0] or "not localised"
+
+
+def _operated(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    source = now.wheels.source
+    return "" if source in ("", PLANNER) else f"{source} drives: it goes on when that ends"
+
+
+# The first rule that holds decides: an end is final, everything else is waited for.
+RULES: Final = (
+    Rule(NavigationState.CANCELLED, _stopped),
+    Rule(NavigationState.FAILED, _new_odom),
+    Rule(NavigationState.PAUSED, _paused),
+    Rule(NavigationState.NOT_LOCALISED, _lost),
+    Rule(NavigationState.NOT_LOCALISED, _not_in_map),
+    Rule(NavigationState.PAUSED, _operated),
+)
 
 
 @dataclass(slots=True)
@@ -106,7 +219,7 @@ class Navigator:
     task: str = ""  # description of the drive, kept after its end
     command_ns: int = 0  # stamp of the request for the drive
     _stops: int = field(default=0, init=False)  # number of stops that are still to be sent
-    _last_ns: int = field(default=0, init=False)
+    _last_ns: int | None = field(default=None, init=False)
     _planner: Planner = field(init=False)
 
     def __post_init__(self) -> None:
@@ -122,9 +235,10 @@ class Navigator:
         self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
     ) -> None:
         """Begin a drive, which replaces the one before."""
-        T_odom_frame, count = now.T_odom_frame(frame), now.wheels.stop_count
-        follower = Follower(paths[0].moved(T_odom_frame), self.settings)
-        self.drive = Drive(task, frame, paths, follower, now.resets, count, now.pose, T_odom_frame, now.pose)
+        follower, pose = Follower(paths[0], self.settings), now.pose
+        self.drive = Drive(
+            task, frame, paths, follower, now.resets, now.wheels.stop_count, float(pose[2]), pose[:2].copy()
+        )
         self.task, self.command_ns, self._stops = task, command_ns, 0
         self.state, self.reason = NavigationState.DRIVING, ""
 
@@ -151,185 +265,188 @@ class Navigator:
 
     def step(self, now: Situation) -> Navigation:
         """Return the motion for a new pose, and the state with its reason."""
-        # A longer time between two poses counts as a second, because a gap is no wait.
-        dt_s = min(max((now.stamp_ns - self._last_ns) * 1e-9, 0.0), 1.0) if self._last_ns else 0.0
+        dt_s = 0.0 if self._last_ns is None else min(max((now.stamp_ns - self._last_ns) * 1e-9, 0.0), LONGEST_STEP_S)
         self._last_ns, drive, settings = now.stamp_ns, self.drive, self.settings
         if drive is None:
             self._stops, stop = max(self._stops - 1, 0), STAND if self._stops else None
             return Navigation(stop, self.state, self.reason)
-        # 1. Wheels, pose, and who else drives: an end is final, everything else is waited for.
+        # 1. Wheels, pose, and who else drives.
         self._follow_map(drive, now)
-        state, reason = self._hindrance(drive, now)
-        if state.is_end:
-            return self._end(state, reason)
-        if state is not NavigationState.DRIVING:
-            drive.waited_s += dt_s if state is NavigationState.NOT_LOCALISED else 0.0
-            if drive.waited_s > settings.unlocalised_s:
-                return self._end(NavigationState.FAILED, f"{state} for {settings.unlocalised_s:g} s: {reason}")
-            return self._give(None if state is NavigationState.PAUSED else STAND, state, reason)
-        drive.resets, drive.waited_s = now.resets, 0.0
-        # 2. The motion along the way; another way where that is not free.
-        motion, reason = (now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps), ""
-        following = drive.follower.step(*motion)
-        around, setpoint, held_by = now.around, following.setpoint, now.wheels.held_by
-        if around is not None and not drive.follower.aligns and not following.done:
-            free_m = self._free_m(drive, now, around)
-            if self._takes_other_way(drive, now, around, following, is_blocked=free_m < LOOK_M or bool(held_by)):
-                following, held_by = drive.follower.step(*motion), ""
-                free_m = self._free_m(drive, now, around)
-            # Without one, drive up to the obstacle.
-            left_m = free_m - self.collision.front_m - 2 * self.collision.stop_m
-            braking_mps = math.sqrt(2 * BRAKE_SHARE * settings.pursuit.acceleration_mps2 * max(left_m, 0.0))
-            setpoint = following.setpoint
-            if setpoint.velocity_mps > braking_mps:
-                share = braking_mps / setpoint.velocity_mps
-                setpoint = Setpoint(braking_mps, setpoint.heading_rad, share * setpoint.yaw_rate_radps)
-                if braking_mps < settings.pursuit.least_mps:
-                    setpoint, reason = STAND, CROSSES if around.moves else OBSTACLE
-        # 3. The end of the path.
+        for rule in RULES:
+            words = rule.words(drive, now, settings)
+            if words:
+                return self._wait(drive, rule.state, words, dt_s)
+        drive.resets = now.resets
+        # 2. The way.
+        following = drive.step(now, self._room_m(drive, now))
         if following.done:
-            return self._finished(drive, following.left_m)
+            return self._finished(drive, following.missed_m)
         if abs(following.offset_m) > settings.corridor_m + self._planner.room_m:
             return self._end(
                 NavigationState.FAILED,
                 f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again",
             )
-        # 4. Blocked: it waits, also where a safety rule holds the wheels, which lets go by itself. A goal to which no
-        #    way leads fails after a time; paths and routes wait.
         if following.left_m < drive.least_m - NEARER_M:
-            drive.least_m, drive.ways, drive.blocked_s, drive.around_s = following.left_m, 0, 0.0, 0.0
-            drive.barred.clear()
-        drive.around_s += dt_s if drive.avoids else 0.0
-        progress = following.left_m, following.offset_m
-        if reason or held_by:
-            drive.blocked_s += dt_s
-            lost_s = drive.blocked_s + (drive.around_s if drive.no_way else 0.0)
-            reason = held_by or reason
-            if drive.paths[0].is_goal and 0 < settings.give_up_s < lost_s:
-                left, why = f"{following.left_m:.1f} m are left", drive.no_way or reason
-                return self._end(NavigationState.FAILED, f"no way to the goal, {left}: {why}")
-            return self._give(setpoint, NavigationState.BLOCKED, f"{reason}: {WAITS}", *progress)
-        # 5. Without any motion for too long, the drive fails.
-        moved_m = math.dist(now.pose[:2], drive.moved_from[:2])
-        turned_rad = abs(wrap_angle(float(now.pose[2] - drive.moved_from[2])))
-        drive.stuck_s += dt_s
-        if moved_m > STEP_M or turned_rad > math.radians(5):
-            drive.moved_from, drive.stuck_s = now.pose, 0.0
+            drive.least_m, drive.ways, drive.lost_s, drive.tried_s = following.left_m, 0, 0.0, 0.0
+        # 3. Obstacles on it, and a safety rule that holds the wheels because of one.
+        following, setpoint, reason = self._around_obstacles(drive, now, following)
+        held_by = now.wheels.held_by
+        if setpoint is None or held_by:  # where it is held, the setpoint is still sent: the monitor lets go by itself
+            return self._blocked(drive, reason if setpoint is None else held_by, following, dt_s, setpoint)
+        # 4. Progress: where it is missing for too long, the drive fails.
+        avoids = drive.detour is not None
+        drive.advance(now, following.left_m, dt_s)
         if drive.stuck_s > settings.stuck_s:
-            parts = f"no progress for {settings.stuck_s:g} s", now.wheels.rule, "look at the robot"
+            why = now.wheels.reason if now.wheels.is_held else AROUND if avoids else ""
+            parts = f"no progress for {settings.stuck_s:g} s", why, "look at the robot"
             return self._end(NavigationState.FAILED, ": ".join(part for part in parts if part))
-        state = NavigationState.AVOIDING if drive.avoids else NavigationState.DRIVING
-        return self._give(setpoint, state, now.wheels.rule, *progress)
+        self.state = NavigationState.AVOIDING if avoids else NavigationState.DRIVING
+        self.reason, drive.waited_s = now.wheels.reason if now.wheels.is_held else reason, 0.0
+        return Navigation(setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _follow_map(self, drive: Drive, now: Situation) -> None:
-        """Move the way with the map; add the motion to that without a pose in the map, which counts once."""
-        T_odom_frame = now.T_odom_frame(drive.frame)
-        if (T_odom_frame != drive.T_odom_frame).any():
-            moved = composed(T_odom_frame[None], relative(drive.T_odom_frame, np.zeros(3)))[0]
-            drive.follower.path, drive.T_odom_frame = drive.follower.path.moved(moved), T_odom_frame
-        drive.unlocalised_m += float(np.hypot(*(now.pose[:2] - drive.pose[:2])))
-        drive.pose, in_map = now.pose, now.in_map
+        """Add the way since the last pose to that without a pose in the map; leave a way of an odom that is lost."""
+        drive.unlocalised_m += float(np.hypot(*(now.pose[:2] - drive.xy)))
+        drive.xy = now.pose[:2].copy()
         if drive.resets != now.resets:
-            drive.unlocalised_m = math.inf
-        if in_map is None or in_map.stamp_ns <= drive.localised_ns:
+            drive.detour, drive.unlocalised_m = None, math.inf
+        in_map = now.in_map
+        if in_map is None or in_map.stamp_ns <= drive.localised_ns:  # no new pose in the map has come
             return
-        if not refusal_of_map(now, self.settings.map_sigma_m):
+        if in_map.state is MapState.LOCALIZED and in_map.sigma_m <= self.settings.map_sigma_m:
             drive.unlocalised_m, drive.localised_ns = 0.0, in_map.stamp_ns
-        elif in_map.sigma_m > self.settings.reach_m:  # it is not known at all
+        elif in_map.sigma_m > UNKNOWN_M:
             drive.unlocalised_m = math.inf
 
-    def _hindrance(self, drive: Drive, now: Situation) -> tuple[NavigationState, str]:
-        """Return what ends the drive or what it waits for, and why; DRIVING without anything."""
-        wheels, in_odom = now.wheels, drive.frame is NavigationFrame.ODOM
-        # A stop or fault that has disarmed the wheels counts also if they were armed again since.
-        fault = wheels.disarmed_by if wheels.needs_request else ""
-        if wheels.stop_count != drive.stop_count:
-            fault = wheels.stopped_by
-        if fault == ASKED:
-            return NavigationState.CANCELLED, ASKED
-        if in_odom and drive.resets != now.resets:
-            return NavigationState.FAILED, "odometry has lost its map and begun again: ask again"
-        if fault:
-            drive.paused = f"disarmed: {fault}: see to it, then {RESUME}"
-        if drive.paused:
-            return NavigationState.PAUSED, drive.paused
-        if now.state is TrackingState.LOST:
-            return NavigationState.NOT_LOCALISED, "odometry is lost"
-        if not in_odom and drive.unlocalised_m > self.settings.unlocalised_m:
-            why = refusal_of_map(now, self.settings.map_sigma_m).partition(":")[0]
-            return NavigationState.NOT_LOCALISED, why or "not localised"
-        if wheels.source not in ("", PLANNER):
-            return NavigationState.PAUSED, f"{wheels.source} drives: it goes on when that ends"
-        return NavigationState.DRIVING, ""
+    def _wait(self, drive: Drive, state: NavigationState, reason: str, dt_s: float) -> Navigation:
+        """Stop and count the time, or end; fail where the pose in the map is missing for too long."""
+        if state.is_end:
+            return self._end(state, reason)
+        if state is NavigationState.NOT_LOCALISED:
+            drive.waited_s += dt_s
+            if drive.waited_s > self.settings.unlocalised_s:
+                return self._end(NavigationState.FAILED, f"{state} for {self.settings.unlocalised_s:g} s: {reason}")
+        self.state, self.reason = state, reason
+        return Navigation(None if state is NavigationState.PAUSED else STAND, state, reason)
 
-    def _free_m(self, drive: Drive, now: Situation, around: Surroundings) -> float:
-        """Return the length of the way ahead that is free, up to LOOK_M; on a path with the clearance to obstacles."""
-        more_m = 0.0 if drive.avoids else self.settings.clearance_m
-        xy = drive.follower.path.xy[drive.follower.ahead(LOOK_M)]
-        is_blocked = self._planner.is_blocked(xy, around, around.room, now.stamp_ns, more_m)
-        return STEP_M * float(np.argmax(is_blocked)) if is_blocked.any() else math.inf
+    def _room_m(self, drive: Drive, now: Situation) -> float:
+        """Return the distance [m] from the side of the base to the nearest obstacle on the next front_m."""
+        if now.around is None:
+            return math.inf
+        near = drive.ahead(now, self.collision.front_m)
+        return float(now.around.room_at(near).min()) - self.collision.half_width_m
+
+    def _around_obstacles(
+        self, drive: Drive, now: Situation, following: Following
+    ) -> tuple[Following, Setpoint | None, str]:
+        """Return progress, motion and the reason why it is slower than wanted; no motion where no way is free."""
+        around, wanted = now.around, following.setpoint
+        if around is None or drive.on_way.aligns:
+            return following, wanted, ""
+        # 1. Where the way is blocked another one is searched, and where that to a goal may be shorter by now.
+        pursuit, room_m = self.settings.pursuit, self._planner.room_m
+        look = now.stamp_ns, pursuit.velocity_mps
+        kept_m = room_m + (self.settings.clearance_m if drive.detour is None else 0.0)
+        first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), kept_m, *look)
+        if self._takes_other_way(drive, now, around, following, is_closed=first_m < math.inf):
+            following = drive.step(now, self._room_m(drive, now))
+            wanted = following.setpoint
+            first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), room_m, *look)
+        # 2. Without a way around it, drive up to the obstacle and wait.
+        left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
+        braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
+        if wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps:  # the base has reached the obstacle
+            return following, None, CROSSES if around.moves else STANDS
+        share = min(1.0, braking_mps / wanted.velocity_mps) if wanted.velocity_mps > 0 else 1.0
+        slower = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
+        return following, slower, ""
 
     def _takes_other_way(
-        self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_blocked: bool
+        self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_closed: bool
     ) -> bool:
-        """True if the base begins another way, because the present one is blocked, or another one is shorter."""
-        settings, way, here, goal = self.settings, drive.follower.path, now.pose[:2], drive.follower.path.goal
-        if not settings.corridor_m or not (is_blocked or (drive.avoids and way.is_goal)):
-            return False
-        # 1. Straight on to a goal, where that is free, with a cell to spare.
-        if way.is_goal and not is_blocked:
-            straight = drive_path([here, goal], way.final_heading_rad, is_goal=True)
-            is_ahead, more_m = (
-                abs(wrap_angle(straight.heading[0] - now.pose[2])) < TURN_RAD,
-                settings.clearance_m + STEP_M,
-            )
-            blocked = self._planner.is_blocked(straight.xy, around, around.seen_room, now.stamp_ns, more_m)
-            if is_ahead and not blocked.any():
-                drive.drive_along(straight, settings, now.speed_mps, 0.0)
+        """True if the base begins another way; is_closed: an obstacle is or will be on the present one.
+
+        A long way around an obstacle is chosen only after a wait as long as the time it costs: it is unknown when the
+        present way is free again, and so at most twice the least time is lost (the ski rental problem).
+        """
+        detour, settings, path = drive.detour, self.settings, drive.paths[0]
+        is_to_goal, is_blocked = detour is not None and path.is_goal, is_closed or bool(now.wheels.held_by)
+        if is_to_goal and not is_blocked:
+            goal = drive.in_odom(path.goal[None], now)[0]
+            if self._planner.is_straight_free(now.pose, goal, around, now.stamp_ns):
+                drive.rejoin(now)
                 return True
-        if now.stamp_ns * 1e-9 - drive.searched_s < (AGAIN_S if is_blocked else SHORTER_S):
+        is_due = is_blocked or (is_to_goal and following.left_m > DOCK_M)
+        passed_ns = now.stamp_ns - drive.searched_ns
+        if not is_due or not settings.corridor_m or passed_ns < (AGAIN_NS if is_blocked else SHORTER_NS):
             return False
-        drive.searched_s = now.stamp_ns * 1e-9
-        # 2. Where the collision monitor has stopped the base, the way is closed, although the grid shows it free.
-        if now.wheels.held_by:
-            outline, v = self.collision, following.setpoint.velocity_mps
-            ahead_m = math.copysign((outline.front_m if v > 0 else outline.rear_m) + outline.stop_m, v) if v else 0.0
-            beside_m = outline.half_width_m if v else math.hypot(outline.front_m, outline.half_width_m)
-            places = np.array([[ahead_m, beside_m, 0.0], [ahead_m, -beside_m, 0.0]])
-            drive.barred.append(composed(now.pose[None], places)[:, :2])
-        # 3. A way to the goal, or to the first free place on the path behind its obstacle.
-        along, heading_rad, join, room = None, math.nan, len(way.s), around.room_with(drive.barred)
-        if not way.is_goal:
-            ahead = drive.follower.ahead(2 * LOOK_M, drive.around_m)
-            is_closed = self._planner.is_blocked(way.xy[ahead], around, room, now.stamp_ns, settings.clearance_m)
-            after = int(np.argmax(is_closed))
-            runs = sliding_window_view(np.append(~is_closed, np.ones(REJOIN, bool)), REJOIN + 1)
-            is_run = np.asarray(runs.all(axis=1))[after:]
-            if not is_run.any():
-                drive.no_way = "the path is not free within sight"
-                return False
-            join = ahead.start + min(after + int(np.argmax(is_run)) + REJOIN, len(is_closed) - 1)
-            goal = way.xy[join]
-            along = drive.paths[0].moved(drive.T_odom_frame).xy
-            heading_rad = way.heading[join] + math.pi * (way.speed[join] < 0)
-        found = self._planner.way(now.pose, goal, around, room, now.stamp_ns, along, heading_rad)
-        if isinstance(found, DrivePath) and is_blocked and drive.ways >= MOST_WAYS:
+        drive.searched_ns, drive.is_waiting = now.stamp_ns, False
+        if is_blocked and detour is not None:
+            drive.tried_s, drive.way_s = drive.tried_s + drive.way_s, 0.0
+        found = self._search(drive, now, around, _kind(following.setpoint) if now.wheels.held_by else None)
+        if not isinstance(found, str) and is_blocked and drive.ways >= MOST_WAYS:
             found = f"{drive.ways} ways were tried"
-        drive.no_way = found if isinstance(found, str) else ""
-        if isinstance(found, str) or (not is_blocked and found.length_m > BETTER * following.left_m):
+        if isinstance(found, str):
+            drive.no_way = found
             return False
-        # 4. Follow it, and then the rest of the path.
-        drive.ways += is_blocked
-        xy, speeds = np.vstack([found.xy, way.xy[join:]]), np.append(found.speed, way.speed[join:])
-        joined = drive_path(xy, way.final_heading_rad, speeds=speeds, is_goal=way.is_goal)
-        drive.drive_along(joined, settings, now.speed_mps, found.length_m)
+        drive.no_way = ""
+        if is_blocked:
+            may_leave = is_closed and (detour is None or around.moves)
+            free_s = self._planner.free_s(drive.ahead(now, following.left_m), around)
+            worth_s = free_s + LOOK_M / settings.pursuit.velocity_mps + drive.lost_s
+            drive.is_waiting = may_leave and found.time_s > worth_s
+            if drive.is_waiting:
+                return False
+            drive.ways += 1
+        elif detour is not None:
+            left_s = detour.time_s * following.left_m / max(detour.follower.path.length_m, SHORTEST_M)
+            if found.time_s > BETTER * left_s:
+                return False
+        drive.begin_detour(found)
         return True
+
+    def _search(self, drive: Drive, now: Situation, around: Surroundings, barred: Move | None) -> Detour | str:
+        """Return a way to the goal, or to the path behind its obstacle; or the reason why there is none."""
+        settings, path = self.settings, drive.paths[0]
+        place, corridor, heading_rad = (0, 0.0), None, math.nan
+        if path.is_goal:
+            goal = drive.in_odom(path.goal[None], now)[0]
+        else:
+            ahead = drive.follower.ahead(2 * LOOK_M)
+            corridor = drive.in_odom(ahead.xy, now)
+            of = around.room_m if barred is None else around.closed_m  # by floor that is not seen
+            near_m = around.near_m(corridor, now.stamp_ns, settings.pursuit.velocity_mps, of)
+            k = _behind(corridor, near_m < self._planner.room_m + settings.clearance_m)
+            if k is None:
+                return "the path is not free within sight"
+            goal, place = corridor[k], (int(ahead.legs[k]), float(ahead.s[k]))
+            leg = path.legs[min(place[0], len(path.legs) - 1)]
+            heading_rad = leg.at(place[1])[2] + (math.pi if leg.backwards else 0.0)
+            heading_rad -= float(now.T_frame_odom(drive.frame)[2])
+        found = self._planner.way(
+            now.pose, goal, around, now.stamp_ns, along=corridor, heading_rad=heading_rad, barred=barred
+        )
+        if isinstance(found, str):
+            return found
+        return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found.time_s, *place)
+
+    def _blocked(
+        self, drive: Drive, reason: str, following: Following, dt_s: float, setpoint: Setpoint | None
+    ) -> Navigation:
+        """Wait for a free way; fail if for too long none leads to a goal. Paths and routes never give up."""
+        drive.lost_s += dt_s
+        lost_s = drive.lost_s + (drive.tried_s if drive.no_way else 0.0)
+        if drive.paths[0].is_goal and not drive.is_waiting and 0 < self.settings.give_up_s < lost_s:
+            why = reason if setpoint is not None else drive.no_way or reason
+            return self._end(NavigationState.FAILED, f"no way to the goal, {following.left_m:.1f} m are left: {why}")
+        self.state, self.reason = NavigationState.BLOCKED, f"{reason}: {WAITS}"
+        return Navigation(setpoint or STAND, self.state, self.reason, following.left_m, following.offset_m)
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:
         """Begin the next path, or end."""
         if len(drive.paths) > 1:
             del drive.paths[0]
-            drive.drive_along(drive.paths[0].moved(drive.T_odom_frame), self.settings, 0.0, 0.0)
+            drive.follower, drive.nearest_m = Follower(drive.paths[0], self.settings), math.inf
             return Navigation(STAND, self.state, self.reason, drive.paths[0].length_m, 0.0)
         if missed_m > self.settings.goal_cm * 0.01:
             return self._end(NavigationState.FAILED, f"the goal is missed by {100 * missed_m:.1f} cm")
@@ -338,15 +455,24 @@ class Navigator:
     def _end(self, state: NavigationState, reason: str) -> Navigation:
         """End the drive, with the first of some stops."""
         self.drive, self._stops = None, STOPS
-        return self._give(STAND, state, reason)
-
-    def _give(
-        self,
-        setpoint: Setpoint | None,
-        state: NavigationState,
-        reason: str,
-        left_m: float = math.nan,
-        offset_m: float = math.nan,
-    ) -> Navigation:
         self.state, self.reason = state, reason
-        return Navigation(setpoint, state, reason, left_m, offset_m)
+        return Navigation(STAND, state, reason)
+
+
+def _behind(path: Array, is_blocked: NDArray[np.bool_]) -> int | None:
+    """Return the first point of a path (N, 2) behind an obstacle about which REJOIN_M of it are free; None without."""
+    ways = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+    free_from = int(np.argmax(is_blocked))
+    for k in range(free_from, len(path)):
+        if is_blocked[k]:
+            free_from = k + 1
+        elif ways[k] - ways[min(free_from, k)] >= REJOIN_M or k == len(path) - 1:
+            return k
+    return None
+
+
+def _kind(setpoint: Setpoint) -> Move:
+    """Return the kind of a motion."""
+    if setpoint.velocity_mps == 0.0:
+        return Move.TURN
+    return Move.AHEAD if setpoint.velocity_mps > 0.0 else Move.BACK

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from omnid.core.navigation.route import Route
 from omnid.errors import OmnidError
 
+MAX_LOOPS: Final = 10_000  # Most rounds of a route, so that the number is bounded.
 LONGEST_TEXT: Final = 200  # characters of a request; so that messages of any size are refused
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # its file has a valid name: at most 255 bytes
-_LOOPS: Final = re.compile(r"loops=([1-9][0-9]{0,3})")
-ROUTE_USAGE: Final = '"teach NAME [replace]", "finish", "repeat NAME [reverse] [loops=N]" or "stop"'
+LONGEST_NAME: Final = 64  # Characters of a route's name, so that its file has a valid name: at most 255 bytes.
+_NAME: Final = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
+_LOOPS: Final = re.compile(r"loops=([1-9][0-9]{0,4})")
+ROUTE_USAGE: Final = '"teach NAME [replace]", "finish", "repeat NAME [reverse] [loops=N] [from=here|start]" or "stop"'
 
 
 class NavigationFrame(StrEnum):
@@ -70,6 +72,7 @@ class RouteRequest:
     name: str = ""
     reverse: bool = False
     loops: int = 1
+    from_start: bool = False  # the whole route; else from where the robot is on it
     replace: bool = False  # teach in the place of a route of that name
     route: Route | None = None  # route that is to be repeated, as read from its file
 
@@ -126,7 +129,7 @@ def route_name(text: str) -> str:
     if not _NAME.fullmatch(text):
         raise OmnidError(
             f"{_shown(text)} is no name of a route: expected letters, digits, '-' and '_', a letter or "
-            "digit first, at most 64"
+            f"digit first, at most {LONGEST_NAME}"
         )
     return text
 
@@ -139,14 +142,20 @@ def route_request(text: str) -> RouteRequest:
             return RouteRequest(RouteAction(action))
         case ["teach", name, *options] if options in ([], ["replace"]):
             return RouteRequest(RouteAction.TEACH, route_name(name), replace=bool(options))
-        case ["repeat", name, *options] if len(options) <= 2:
-            is_reverse, loops = "reverse" in options, 1
-            for option in options:
-                if found := _LOOPS.fullmatch(option):
-                    loops = int(found[1])
-            if len(options) == is_reverse + any(map(_LOOPS.fullmatch, options)):
-                return RouteRequest(RouteAction.REPEAT, route_name(name), is_reverse, loops)
-    raise OmnidError(f"{_shown(text)} is no request about routes: expected {ROUTE_USAGE}, N at most 9999")
+        case ["repeat", name, *options] if len(options) == len({option.partition("=")[0] for option in options}):
+            return _repeat(route_name(name), options, text)
+    raise OmnidError(f"{_shown(text)} is no request about routes: expected {ROUTE_USAGE}")
+
+
+def _repeat(name: str, options: list[str], text: str) -> RouteRequest:
+    loops = 1
+    for option in options:
+        found = _LOOPS.fullmatch(option)
+        if found and int(found[1]) <= MAX_LOOPS:
+            loops = int(found[1])
+        elif option not in ("reverse", "from=here", "from=start"):
+            raise OmnidError(f"{_shown(text)}: expected {ROUTE_USAGE}, N at most {MAX_LOOPS}")
+    return RouteRequest(RouteAction.REPEAT, name, "reverse" in options, loops, "from=start" in options)
 
 
 def _shown(text: str) -> str:

@@ -14,16 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative, wrapped
-from omnid.core.navigation.path import MAX_LENGTH_M, SHORTEST_M, DrivePath, drive_path
+from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path
 from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
 
+# Set by trial on development seeds, where a line gives no other reason.
+SPACING_M, SPACING_RAD = 0.1, math.radians(10)  # Motion between two points of a recording.
 MOST_POINTS: Final = 15_000  # Points of a route, so that it is bounded: 1.5 km.
+SHORTEST_ROUTE_M: Final = 0.5
 LEAST_MPS: Final = 0.1  # Slower parts of the recording are repeated at this speed.
+STANDING_MPS: Final = 0.02
 SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be in the map
-ENTRY_M: Final = 1.0  # most distance of the robot from a route that it repeats, and between the ends of a closed one
+CLOSED_M: Final = 1.0  # Most distance between the ends of a route that is driven in rounds.
+ENTRY_M: Final = 1.5  # Most distance of the robot from a route that it repeats.
+ENTRY_M_PER_RAD: Final = 0.5  # Cost of a radian of heading error where several pieces of a route are near.
+BESIDE_M: Final = 0.25  # A robot farther from the route drives to a point ahead on it.
+JOIN: Final = 2.5  # Way along the route to that point by lateral distance: at 22 degrees, which is no corner.
 DECIMALS: Final = 6  # Decimals of a route, as in its file, so that reading it changes nothing.
 FarKeyframe = Callable[[int], "KeyframePose | None"]
 
@@ -51,12 +59,12 @@ class Route:
     @property
     def length_m(self) -> float:
         """Length of the way."""
-        return float(_ways_m(self.poses)[-1])
+        return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
 
     @property
     def is_closed(self) -> bool:
         """True if the route ends at its start: then it is driven in rounds."""
-        return math.dist(self.poses[0, :2], self.poses[-1, :2]) <= ENTRY_M
+        return math.dist(self.poses[0, :2], self.poses[-1, :2]) <= CLOSED_M
 
     def fits(self, keyframe: FarKeyframe) -> bool:
         """True if a map holds the keyframes that were noted, by their stamps."""
@@ -100,82 +108,127 @@ class RouteRecorder:
         self.name = name
         self.length_m = 0.0
         self._points: list[tuple[Array, float, int, Array]] = []
-        self._newest: tuple[Array, float, int, Array] | None = None  # where the recording ends
+        self._newest: tuple[Array, int, Array] | None = None  # pose, keyframe, pose in it: where the recording ends
 
     def add(self, pose: Array, speed_mps: float, keyframe: int, keyframe_pose: Array) -> None:
         """Add a pose (3,) of the base in the map where it has moved; keyframe_pose (3,): of its keyframe.
 
         Raise OmnidError for a route that gets too long.
         """
-        moved_m = math.inf
+        self._newest = pose, keyframe, relative(keyframe_pose, pose)
         if self._points:
             step = relative(self._points[-1][0], pose)
             moved_m = math.hypot(step[0], step[1])
-            # The sign of the speed is that of the step, and of a turn on the spot that of the point before.
-            speed_mps = math.copysign(speed_mps, step[0] if moved_m > SHORTEST_M / 2 else self._points[-1][1])
-        self._newest = pose, speed_mps, keyframe, relative(keyframe_pose, pose)
-        if moved_m < SHORTEST_M and abs(float(wrapped(step[2]))) < math.radians(10):
-            return
-        self.length_m += moved_m if self._points else 0.0
-        if len(self._points) >= MOST_POINTS - 1 or self.length_m > MAX_LENGTH_M:
+            if moved_m < SPACING_M and abs(float(wrapped(step[2]))) < SPACING_RAD:
+                return
+            self.length_m += moved_m
+        if len(self._points) >= MOST_POINTS or self.length_m > MAX_LENGTH_M:
             raise OmnidError(f"the route {self.name} is too long: {len(self._points)} points, {self.length_m:.0f} m")
-        self._points.append(self._newest)
+        if abs(speed_mps) < STANDING_MPS and self._points:
+            speed_mps = math.copysign(STANDING_MPS, self._points[-1][1])
+        self._points.append((pose, speed_mps, keyframe, relative(keyframe_pose, pose)))
 
     def route(self, keyframe: FarKeyframe, noted: Mapping[int, int], created_s: int, map_name: str) -> Route:
         """Return the route in the map as it is now; noted: stamps of keyframes that identify the map.
 
         Raise OmnidError for one that is too short.
         """
-        if self._newest is None or self.length_m < 5 * SHORTEST_M:
+        if self.length_m < SHORTEST_ROUTE_M:
             raise OmnidError(
-                f"the route {self.name} is {self.length_m:.2f} m long, which is too short: drive it, then finish; "
-                "`omnid route stop` drops it"
+                f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
+                "and more: drive it, then finish; `omnid route stop` drops it"
             )
-        poses, speeds, keyframes, in_keyframe = zip(*self._points, self._newest, strict=True)
+        poses, speeds, keyframes, in_keyframe = zip(*self._to_its_end(), strict=True)
         stamps = dict(noted)
         for id in set(keyframes):
             found = keyframe(id) if id != NO_KEYFRAME else None
             if found is not None:
                 stamps[id] = found.stamp_ns
-        of_points = np.array(speeds).round(DECIMALS), np.array(keyframes, np.int64), np.array(in_keyframe)
-        route = Route(self.name, np.array(poses), *of_points, stamps, created_s, map_name)
-        rounded = route.in_map(keyframe).round(DECIMALS), route.in_keyframe.round(DECIMALS)
-        return replace(route, poses=rounded[0], in_keyframe=rounded[1])
+        route = Route(
+            self.name,
+            np.array(poses),
+            np.array(speeds).round(DECIMALS),
+            np.array(keyframes, np.int64),
+            np.array(in_keyframe),
+            stamps,
+            created_s,
+            map_name,
+        )
+        return replace(
+            route, poses=route.in_map(keyframe).round(DECIMALS), in_keyframe=route.in_keyframe.round(DECIMALS)
+        )
+
+    def _to_its_end(self) -> list[tuple[Array, float, int, Array]]:
+        """Return the points; the last one is where the recording ends, however near to that before it."""
+        if self._newest is None:
+            return self._points
+        last, speed_mps, *_ = self._points[-1]
+        pose, keyframe, in_keyframe = self._newest
+        step = relative(last, pose)
+        if math.hypot(step[0], step[1]) <= 0.5 * SPACING_M or len(self._points) >= MOST_POINTS:
+            return [*self._points[:-1], (pose, speed_mps, keyframe, in_keyframe)]
+        return [*self._points, (pose, math.copysign(speed_mps, step[0]), keyframe, in_keyframe)]
 
 
-def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool) -> list[DrivePath]:
+def repeated_paths(
+    route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool, from_start: bool = False
+) -> list[DrivePath]:
     """Return the paths that repeat a route from the nearest point on it to a pose (3,) of the base in the map.
 
-    A closed route is driven in rounds, any other there and back, `loops` times in all. Raise OmnidError where
-    the robot is not near it, or at the end of the only way.
+    A closed route is driven in rounds, any other there and back, `loops` times in all. from_start: the whole route.
+    Raise OmnidError where the robot is not near it, or not near its start, or at the end of the only way.
     """
     there = route.reversed() if reverse else route
     poses = there.in_map(keyframe)
-    # 1. The robot begins at the nearest point by place and heading, of which a radian counts as half a metre. Where a
-    #    closed route ends, a new round begins.
-    away_m, ways_m = np.hypot(*(poses[:, :2] - pose[:2]).T), _ways_m(poses)
-    cost_m = away_m + 0.5 * np.abs(wrapped(poses[:, 2] - pose[2]))
-    cost_m[away_m > ENTRY_M] = math.inf
-    if route.is_closed and np.isfinite(cost_m[ways_m < ways_m[-1] - ENTRY_M]).any():
-        cost_m[ways_m >= ways_m[-1] - ENTRY_M] = math.inf
-    if away_m.min() > ENTRY_M:
-        raise OmnidError(f"the robot is {away_m.min():.1f} m away from the route: drive it to within {ENTRY_M:g} m")
-    first = int(np.argmin(cost_m))
-    if loops == 1 and ways_m[-1] - ways_m[first] <= 2 * SHORTEST_M:
+    # 1. Where on it the robot begins: at the start, or at the nearest point by place and heading.
+    away_m = np.hypot(*(poses[:, :2] - pose[:2]).T)
+    least_m, first = (away_m[0], 0) if from_start else (away_m.min(), _nearest(there, poses, pose, away_m))
+    if least_m > ENTRY_M:
+        where = "the start of the route" if from_start else "the route"
+        to = "or begin where it is on the route (from=here)" if from_start else "anywhere on it"
+        raise OmnidError(
+            f"the robot is {least_m:.1f} m away from {where}: drive it there, to within {ENTRY_M:g} m, {to}"
+        )
+    ways_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0).T)))
+    if loops == 1 and ways_m[-1] <= BESIDE_M:
         raise OmnidError("the robot is at the end of the route: repeat it in reverse, or drive to its start first")
-    # 2. The rest of the round, and the others.
-    rounds = [there] if route.is_closed else [there, there.reversed()]
-    ways = [_path(each, each.in_map(keyframe)) for each in rounds[:loops]]
-    return [_path(there, poses, first), *(ways[k % len(ways)] for k in range(1, loops))]
+    # 2. Off the route it joins it farther on, before the next corner.
+    is_beside = away_m[first] > BESIDE_M
+    if is_beside and not from_start:
+        goes_on = (
+            (ways_m <= JOIN * away_m[first])
+            & (np.abs(wrapped(poses[first:, 2] - poses[first, 2])) < CORNER_RAD)
+            & (there.speeds[first:] * there.speeds[first] > 0)
+        )
+        goes_on[0] = True
+        first += int(np.argmin(np.append(goes_on, False))) - 1
+    # 3. The rest of the round, and the others.
+    paths = [_path(there, poses, first, pose if is_beside else None)]
+    if loops > 1:
+        rounds = [there] if route.is_closed else [there, there.reversed()]
+        ways = [_path(each, each.in_map(keyframe), 0) for each in rounds]
+        paths += [ways[k % len(ways)] for k in range(1, loops)]
+    return paths
 
 
-def _path(route: Route, poses: Array, first: int = 0) -> DrivePath:
-    """Return the path from a point of the route on."""
+def _nearest(route: Route, poses: Array, pose: Array, away_m: Array) -> int:
+    """Return the nearest point of a route by place and heading; at the end of a closed one, a new round begins."""
+    cost = away_m + ENTRY_M_PER_RAD * np.abs(wrapped(poses[:, 2] - pose[2]))
+    near = away_m <= ENTRY_M
+    if route.is_closed:
+        way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        before_end = near & (way_m < way_m[-1] - CLOSED_M)
+        near = before_end if before_end.any() else near
+    return int(np.argmin(np.where(near, cost, np.inf)))
+
+
+def _path(route: Route, poses: Array, first: int, pose: Array | None = None) -> DrivePath:
+    """Return the path from a point of the route on, from the pose of a robot beside it if one is given."""
     first = min(first, len(poses) - 2)
-    speeds = np.copysign(np.maximum(np.abs(route.speeds[first:]), LEAST_MPS), route.speeds[first:])
-    return drive_path(poses[first:, :2], float(poses[-1, 2]), speeds=speeds)
-
-
-def _ways_m(poses: Array) -> Array:
-    """Return the way (N,) to each of some poses (N, 3)."""
-    return np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    xy, speeds = poses[first:, :2], np.maximum(np.abs(route.speeds[first:]), LEAST_MPS)
+    backwards = route.speeds[first:] < 0
+    if pose is not None:
+        xy = np.vstack([pose[None, :2], xy])
+        speeds, backwards = np.append(speeds[:1], speeds), np.append(backwards[:1], backwards)
+        backwards[:2] = False
+    return drive_path(xy, float(poses[-1, 2]), speeds=speeds, backwards=[bool(b) for b in backwards])

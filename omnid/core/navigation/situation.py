@@ -1,19 +1,22 @@
-"""Inputs of the navigation at a pose, and reasons to refuse a drive that follow from them."""
+"""Inputs of the navigation at a pose, and reasons to refuse or to wait that follow from them."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.se2_arrays import relative
+from calib.se2_arrays import composed
 from omnid.core.control.safety_rules import COMMAND_STALE, IDLE
-from omnid.core.navigation.planner import Surroundings
 from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.surroundings import Surroundings
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
+
+# A larger sigma says that the pose in the map is not known at all, because it is a kilometre then.
+UNKNOWN_M: Final = 100.0
 
 
 class WheelState(NamedTuple):
@@ -29,9 +32,9 @@ class WheelState(NamedTuple):
     stopped_by: str = ""  # reason of the newest of them
 
     @property
-    def rule(self) -> str:
-        """Rule of the controller that holds the wheels now; empty without one."""
-        return "" if self.reason in (IDLE, COMMAND_STALE) else self.reason
+    def is_held(self) -> bool:
+        """True if a rule of the controller holds the wheels now."""
+        return self.reason not in ("", IDLE, COMMAND_STALE)
 
 
 class MapPosition(NamedTuple):
@@ -56,39 +59,51 @@ class Situation(NamedTuple):
     in_map: MapPosition | None = None  # None: nothing is known yet
     around: Surroundings | None = None  # what is about the base; None: nothing is known of it now
 
-    def T_odom_frame(self, frame: NavigationFrame) -> Array:
-        """Return the pose (3,) of a frame in odom."""
-        if frame is NavigationFrame.ODOM or self.in_map is None:
-            return np.zeros(3)
-        return relative(self.in_map.T_map_odom, np.zeros(3))
+    def T_frame_odom(self, frame: NavigationFrame) -> Array:
+        """Return the pose of odom in a frame (3,)."""
+        if frame is NavigationFrame.MAP and self.in_map is not None:
+            return self.in_map.T_map_odom
+        return np.zeros(3)
+
+    def map_pose(self) -> Array:
+        """Return the pose of the base in the map (3,)."""
+        return self.pose_in(NavigationFrame.MAP)
 
     def pose_in(self, frame: NavigationFrame) -> Array:
         """Return the pose of the base in a frame (3,)."""
-        return relative(self.T_odom_frame(frame), self.pose)
+        return np.asarray(composed(self.T_frame_odom(frame)[None], self.pose)[0])
 
 
 def refusal_to_drive(situation: Situation | None, frame: NavigationFrame, map_sigma_m: float) -> str:
     """Return why no drive can begin now, with the remedy; empty if it can."""
     if situation is None:
         return "there is no pose yet: wait until the robot is ready (`omnid listen`)"
-    if not situation.wheels.armed:
-        return f"not armed ({situation.wheels.disarmed_by}): arm it first (`omnid arm`)"
+    wheels = situation.wheels
+    if not wheels.armed:
+        return f"not armed ({wheels.disarmed_by}): arm it first (`omnid arm`)"
     if situation.state is TrackingState.LOST:
         return "odometry is lost: check the images and the light (`omnid listen`)"
-    return "" if frame is NavigationFrame.ODOM else refusal_of_map(situation, map_sigma_m)
+    if frame is NavigationFrame.MAP:
+        return refusal_of_map(situation, map_sigma_m)
+    return ""
 
 
 def refusal_of_map(situation: Situation, map_sigma_m: float) -> str:
     """Return why the pose in the map cannot be used, with the remedy; empty if it can."""
     in_map = situation.in_map
-    if in_map is None or in_map.state is not MapState.LOCALIZED:
+    if in_map is None or in_map.state is MapState.LOST:
         return (
-            "not localised in a map: no place of it has been recognised: start with one (`omnid run --map`), and drive "
-            "it a little where the map was made, or use the frame odom"
+            "not localised in a map: start it with one (`omnid run --map`) and drive it a little where the map "
+            "was made, or use the frame odom"
+        )
+    if in_map.state is MapState.ODOMETRY_ONLY:
+        return (
+            "not localised in a map: no place of it has been recognised yet: drive it a little where the map was "
+            "made (in a new map: back to where it has been), or use the frame odom"
         )
     if not in_map.sigma_m <= map_sigma_m:
         return (
-            f"the pose in the map is uncertain by {in_map.sigma_m:.2f} m, more than {map_sigma_m:g}: drive it a little "
-            "where the map was made"
+            f"the pose in the map is uncertain by {in_map.sigma_m:.2f} m, more than "
+            f"{map_sigma_m:g}: drive it a little where the map was made"
         )
     return ""

@@ -221,4 +221,7 @@ def test_unknown_floor_that_stops_the_wheels_is_passed(tmp_path: Path) -> None:
     robot.see(ranges, free)
     robot.stage.process(WheelState(True, False, held_by=UNKNOWN))
     robot.pass_on()
+    assert robot.updates[-1].state is NavigationState.BLOCKED
+    robot.stage.process(WheelState(True, False))
+    robot.pass_on()
     assert robot.updates[-1].state is NavigationState.AVOIDING

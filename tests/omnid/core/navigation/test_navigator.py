@@ -12,7 +12,7 @@ from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.navigator import STOPS, WAITS, Navigation, Navigator
-from omnid.core.navigation.path import drive_path
+from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
@@ -28,7 +28,7 @@ def driving(
 ) -> DrivenBase:
     """Return a base that is on its way to a goal 5 m ahead."""
     base = DrivenBase(Navigator(settings), seed)
-    path = drive_path([(0.0, 0.0), (5.0, 0.0)], 0.0)
+    path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
     base.navigator.start("goal", frame, [path], base.seen(), command_ns=7)
     base.run(20, lambda answer: answer.left_m < 4.0, rest_s=0)
     assert base.v > 0.3 and base.navigator.state is NavigationState.DRIVING
@@ -224,7 +224,7 @@ GOAL_M, GOAL_RAD = 0.03, math.radians(1)
 
 def to_goal(base: DrivenBase, x: float, y: float, heading: float | None) -> None:
     """Begin to drive to a goal in odom."""
-    path = drive_path([base.pose[:2], (x, y)], heading, is_goal=True)
+    path = DrivePath((straight_leg(base.pose, (x, y)),), heading)
     base.navigator.start("goal", NavigationFrame.ODOM, [path], base.seen())
 
 
@@ -252,7 +252,7 @@ def test_reaches_goals_within_3_cm_and_1_degree(goal: tuple[float, float, float]
 def test_drives_a_square_of_10_m_and_turns_at_its_corners() -> None:
     corners = [(0.0, 0.0), (2.5, 0.0), (2.5, 2.5), (0.0, 2.5), (0.0, 0.0)]
     path = drive_path(corners, 0.0)
-    assert len(path.ends) == 4
+    assert len(path.legs) == 4
     for seed in range(3):
         base = DrivenBase(Navigator(NavigationSettings()), seed)
         base.navigator.start("path", NavigationFrame.ODOM, [path], base.seen())
@@ -282,8 +282,8 @@ def test_follows_curves_within_5_cm_and_slows_down_in_them() -> None:
 
 def test_drives_backwards_where_the_path_was_driven_so() -> None:
     points = [(0.0, 0.0), (2.0, 0.0), (1.0, 0.0)]
-    path = drive_path(points, 0.0, speeds=[1.0, 1.0, -1.0])
-    assert len(path.ends) == 2
+    path = drive_path(points, 0.0, backwards=[False, False, True])
+    assert [leg.backwards for leg in path.legs] == [False, True]
     base = DrivenBase(Navigator(NavigationSettings()), 2)
     base.navigator.start("path", NavigationFrame.ODOM, [path], base.seen())
     assert base.run(60).state is NavigationState.REACHED
@@ -293,11 +293,11 @@ def test_drives_backwards_where_the_path_was_driven_so() -> None:
 
 def test_follows_the_map_when_it_is_corrected() -> None:
     base = DrivenBase(Navigator(NavigationSettings()), 6, T_map_odom=(1.0, -0.5, 0.4))
-    pose = base.seen().pose_in(NavigationFrame.MAP)
+    pose = base.seen().map_pose()
     goal = pose + np.array([3.0, 1.0, 0.2])
-    base.navigator.start("goal", NavigationFrame.MAP, [drive_path([pose[:2], goal[:2]], goal[2])], base.seen())
+    base.navigator.start("goal", NavigationFrame.MAP, [DrivePath((straight_leg(pose, goal),), goal[2])], base.seen())
     base.run(60, lambda answer: answer.left_m < 1.5, rest_s=0)
     base.T_map_odom = base.T_map_odom + np.array([0.1, 0.05, 0.02])
     assert base.run(60).state is NavigationState.REACHED
-    found = base.seen().pose_in(NavigationFrame.MAP)
+    found = base.seen().map_pose()
     assert math.dist(found[:2], goal[:2]) < 0.04 and abs(found[2] - goal[2]) < 0.03

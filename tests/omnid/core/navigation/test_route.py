@@ -80,9 +80,9 @@ def test_a_route_ends_where_the_robot_stood_when_it_was_finished(last: int) -> N
     route = taught(np.vstack([poses, standing]), places := Map(poses))
     np.testing.assert_allclose(route.poses[-1], standing[-1], atol=1e-6)
     (path,) = repeated_paths(route, places, poses[0], loops=1, reverse=False)
-    assert len(path.ends) == 1
+    assert len(path.legs) == 1 and not path.legs[0].backwards
     np.testing.assert_allclose(path.goal, poses[-1, :2], atol=1e-6)
-    assert path.speed.min() == pytest.approx(0.3), "the last step is driven as the others"
+    assert path.legs[0].speed.min() == pytest.approx(0.3), "the last step is driven as the others"
 
 
 def test_a_route_moves_with_the_keyframes_of_its_map() -> None:
@@ -133,6 +133,32 @@ def test_is_repeated_from_anywhere_on_it(start: tuple[float, float, float]) -> N
     assert np.percentile(on_way[joined:], 95) < 0.05
 
 
+def test_a_robot_beside_the_route_joins_it_ahead_without_a_corner_and_not_past_one() -> None:
+    straight = np.column_stack([np.arange(0, 6, 0.02), np.zeros(300), np.zeros(300)])
+    corner = straight[-1] + np.column_stack([np.zeros(100), np.arange(0.02, 2.02, 0.02), np.full(100, math.pi / 2)])
+    route = taught(np.vstack([straight, corner]), places := Map(straight))
+    for y_m in (0.8, -0.8):
+        (path,) = repeated_paths(route, places, np.array([2.0, y_m, 0.0]), loops=1, reverse=False)
+        assert len(path.legs) == 2, "no corner but that of the route"
+        on_route = path.legs[0].xy[np.abs(path.legs[0].xy[:, 1]) < 0.01]
+        assert on_route[0, 0] == pytest.approx(2.0 + 2.5 * 0.8, abs=0.2)
+    (path,) = repeated_paths(route, places, np.array([5.6, 0.9, 0.0]), loops=1, reverse=False)
+    assert any(math.dist(xy, (6.0, 0.0)) < 0.15 for leg in path.legs for xy in leg.xy), "its corner is not cut"
+
+
+def test_the_whole_route_is_driven_from_its_start_only() -> None:
+    poses = way()
+    route, places = taught(poses, Map(poses)), Map(poses)
+    near, far = np.array([0.2, 0.4, 0.0]), poses[200]
+    (path,) = repeated_paths(route, places, near, loops=1, reverse=False, from_start=True)
+    assert path.length_m > route.length_m and np.hypot(*(path.legs[0].xy - poses[0, :2]).T).min() < 0.1
+    with pytest.raises(OmnidError, match=r"3\.\d m away from the start of the route: .*from=here"):
+        repeated_paths(route, places, far, loops=1, reverse=False, from_start=True)
+    repeated_paths(route, places, poses[-10], loops=1, reverse=True, from_start=True)
+    with pytest.raises(OmnidError, match="the robot is at the end of the route: repeat it in reverse"):
+        repeated_paths(route, places, poses[-1], loops=1, reverse=False)
+
+
 def test_is_driven_back_and_there_again_and_in_rounds() -> None:
     poses = way(4.0)
     places = Map(poses)
@@ -154,10 +180,8 @@ def test_is_driven_back_and_there_again_and_in_rounds() -> None:
 @pytest.mark.hazard("H29")
 def test_a_robot_that_is_not_near_is_refused() -> None:
     poses = way()
-    with pytest.raises(OmnidError, match=r"3\.\d m away from the route"):
+    with pytest.raises(OmnidError, match=r"3\.\d m away from the route: drive it there"):
         repeated_paths(taught(poses, Map(poses)), Map(poses), np.array([0.0, 3.5, 0.0]), loops=1, reverse=False)
-    with pytest.raises(OmnidError, match="the robot is at the end of the route: repeat it in reverse"):
-        repeated_paths(taught(poses, Map(poses)), Map(poses), poses[-1], loops=1, reverse=False)
 
 
 def test_a_piece_that_was_driven_backwards_is_repeated_so() -> None:
@@ -167,7 +191,7 @@ def test_a_piece_that_was_driven_backwards_is_repeated_so() -> None:
         recorder.add(pose, speed, 0, places.poses[0])
     route = recorder.route(places, places.stamps, 0, "m")
     (path,) = repeated_paths(route, places, np.zeros(3), loops=1, reverse=False)
-    assert (path.speed[path.ends] < 0).tolist() == [False, True]
+    assert [leg.backwards for leg in path.legs] == [False, True]
 
 
 @pytest.mark.parametrize(("turn_deg", "legs"), [(35.0, 1), (-35.0, 1), (45.0, 2), (-45.0, 2), (180.0, 2)])
@@ -177,10 +201,10 @@ def test_a_leg_ends_where_the_path_turns_by_more_than_40_degrees(turn_deg: float
         first = np.array([math.cos(begin), math.sin(begin)])
         then = np.array([math.cos(begin + turn), math.sin(begin + turn)])
         path = drive_path([(0.0, 0.0), first, first + then])
-        assert len(path.ends) == legs and path.length_m == pytest.approx(2.0, abs=0.05)
+        assert len(path.legs) == legs and path.length_m == pytest.approx(2.0, abs=0.05)
         if legs == 2:
-            np.testing.assert_allclose(path.xy[path.ends[0]], first)
-            np.testing.assert_allclose(path.xy[path.ends[0] + 1], first)
+            np.testing.assert_allclose(path.legs[0].xy[-1], first)
+            np.testing.assert_allclose(path.legs[1].xy[0], first)
 
 
 @pytest.mark.parametrize(
@@ -206,6 +230,7 @@ def test_other_points_are_no_path_and_the_message_says_why(points: ArrayLike, wo
         ("stop", RouteRequest(RouteAction.STOP)),
         ("repeat hall", RouteRequest(RouteAction.REPEAT, "hall")),
         ("  repeat  hall-2 reverse  loops=12 ", RouteRequest(RouteAction.REPEAT, "hall-2", True, 12)),
+        ("repeat hall from=start loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2, True)),
     ],
 )
 def test_requests_about_routes(text: str, expected: RouteRequest) -> None:
@@ -217,7 +242,7 @@ def test_requests_about_routes(text: str, expected: RouteRequest) -> None:
     [
         "",
         "teach",
-        "repeat a loops=2 loops=3",
+        "repeat a from=here from=start",
         "teach ../etc",
         "repeat a loops=0",
         "finish now",

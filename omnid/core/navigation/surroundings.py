@@ -1,0 +1,185 @@
+"""Surroundings of the base, in odom: the grid of the obstacles, and the predicted places of moving objects.
+
+A moving object keeps its velocity (van den Berg, Lin, Manocha 2008, "Reciprocal velocity obstacles", ICRA: the usual
+assumption over some seconds). It is no part of the grid here, but an obstacle where the base would meet it. Unknown
+floor has a cost, as it may be seen when the base comes near. Floor that was not seen from near, such as behind a plain
+surface, is an obstacle until it is seen, because coming nearer shows no more. So is the end of a way along which small
+probabilities of obstacles add up to more than the risk, though each of its cells is free: the collision monitor stops
+the base there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.control.collision_monitor import CollisionSettings, Outline, unknown_ends
+from omnid.core.obstacles.grid import CELL_M, OCCUPIED, UNKNOWN, FloorGrid
+from omnid.core.obstacles.moving_tracker import MovingObstacle
+
+Array = NDArray[np.float64]
+Ranges = NDArray[np.floating]
+Flags = NDArray[np.bool_]
+
+FAR_M: Final = 1e3  # distance where there is no obstacle
+NEAR_M: Final = 1.2  # Floor nearer than that would be seen if it could be.
+HORIZON_S: Final = 4.0  # of a prediction; then it stays
+MEETING_S: Final = 0.6  # by which the base and what moves may be early or late
+LARGEST_SIGMA_M: Final = 0.15  # Most uncertainty of a prediction that is kept free: beyond it nothing would be free.
+OWN_M: Final = 0.25  # beyond its radius, cells are those of what moves
+TRAIL_S: Final = 0.5  # The grid shows what moves where it was for this time, because pairs vote.
+SPECK: Final = np.ones((3, 3), np.uint8)  # unknown floor that is smaller stops no base
+# Least change of the room between two points of a way.
+ROUNDING_M: Final = 0.1 * CELL_M
+
+
+class Surroundings:
+    """The grid of a pair with the distances in it, and what moves; positions in odom."""
+
+    def __init__(
+        self,
+        grid: FloorGrid,
+        moving: Sequence[MovingObstacle] = (),
+        stamp_ns: int = 0,
+        pose: Array | None = None,
+        before: Surroundings | None = None,
+        ends: Array | None = None,
+    ) -> None:
+        """stamp_ns, pose (3,): of the pair. before: surroundings of an earlier pair, in the same odom.
+
+        ends (N, 2): where near ways end, by `near_ends`.
+        """
+        self.grid, self.stamp_ns, states = grid, stamp_ns, grid.states
+        self._state = np.array([(m.x_m, m.y_m, m.vx_mps, m.vy_mps) for m in moving]).reshape(-1, 4)
+        self._radius_m = np.array([m.radius_m for m in moving])
+        self._covariance = np.array([m.covariance for m in moving]).reshape(-1, 4, 4)
+        # 1. Obstacles at rest: what moves is left out, with its trail.
+        is_occupied = states == OCCUPIED
+        trail = self._state[:, :2] - TRAIL_S * self._state[:, 2:]
+        is_own = _from_segments_m(self._places(is_occupied), trail, self._state[:, :2]) <= self._radius_m + OWN_M
+        is_occupied[is_occupied] = ~is_own.any(axis=1)
+        self.room_m = distances_m(is_occupied)  # of each cell to the nearest obstacle
+        # 2. Floor that is not known, and floor that was not seen although the base came near.
+        self.is_unknown = states == UNKNOWN
+        is_patch = cv2.morphologyEx(self.is_unknown.view(np.uint8), cv2.MORPH_OPEN, SPECK) > 0
+        is_unseen = np.zeros(states.shape, bool)
+        if pose is not None:
+            middle = grid.corner_m + 0.5 * CELL_M - pose[:2]
+            y, x = CELL_M * np.indices(states.shape) + middle[::-1, None, None]
+            is_unseen = np.hypot(x, y) < NEAR_M
+        if before is not None:
+            is_unseen |= self._cells(before._unseen)
+        is_unseen &= is_patch
+        self._unseen: Array = self._places(is_unseen)
+        # 3. Where ways end among cells each of which is free.
+        if ends is not None:
+            is_end = self._cells(ends)
+            self.is_unknown, is_unseen = self.is_unknown | is_end, is_unseen | is_end
+        self.closed_m = distances_m(
+            is_occupied | is_unseen
+        )  # of each cell to an obstacle or to floor that was not seen from near
+
+    @property
+    def moves(self) -> bool:
+        """True if something moves."""
+        return len(self._state) > 0
+
+    def _places(self, flags: Flags) -> Array:
+        """Return the middles (N, 2) of the cells that are set, row by row."""
+        return np.asarray(self.grid.corner_m + CELL_M * (np.argwhere(flags)[:, ::-1] + 0.5))
+
+    def _cells(self, points: Array) -> Flags:
+        """Return the cells in which points (N, 2) are."""
+        flags = np.zeros(self.grid.occupied.shape, bool)
+        rows, columns = self.grid.at(points)
+        inside = (np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < len(flags))
+        flags[rows[inside], columns[inside]] = True
+        return flags
+
+    def room_at(self, points: Array, of: Array | None = None) -> Array:
+        """Return the distance of points (N, 2) to the nearest obstacle, FAR_M outside the grid; of: other distances."""
+        of = self.room_m if of is None else of
+        rows, columns = self.grid.at(points)
+        size = len(of)
+        inside = (np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < size)
+        return np.asarray(np.where(inside, of[rows.clip(0, size - 1), columns.clip(0, size - 1)], FAR_M))
+
+    def movers(self, now_ns: int) -> Array:
+        """Return position, velocity and radius (K, 5) of what moves, as predicted for now, with one sigma."""
+        age_s = (now_ns - self.stamp_ns) * 1e-9
+        t = age_s + 0.5 * HORIZON_S
+        P = np.moveaxis(self._covariance, 0, 2)
+        variance = np.maximum(*(P[k, k] + 2 * t * P[k, k + 2] + t**2 * P[k + 2, k + 2] for k in (0, 1)))
+        radius_m = self._radius_m + np.minimum(np.sqrt(np.maximum(variance, 0.0)), LARGEST_SIGMA_M)
+        xy, velocity = self._state[:, :2], self._state[:, 2:]
+        return np.column_stack([xy + age_s * velocity, velocity, radius_m])
+
+    def near_m(self, path: Array, now_ns: int, speed_mps: float, of: Array | None = None) -> Array:
+        """Return the distance (N,) of points of a path (N, 2) from what is in the way; of: as in `room_at`.
+
+        What moves counts where it is when the base, at a speed, is at a point.
+        """
+        near_m = self.room_at(path, of)
+        if not self.moves:
+            return near_m
+        movers, times_s = self.movers(now_ns), _ways_m(path) / speed_mps
+        early, late = (
+            movers[:, :2] + np.clip(times_s + shift_s, 0.0, HORIZON_S)[:, None, None] * movers[:, 2:4]
+            for shift_s in (-MEETING_S, MEETING_S)
+        )
+        return np.asarray(np.minimum(near_m, (_from_segments_m(path, early, late) - movers[:, 4]).min(axis=1)))
+
+    def first_blocked_m(self, path: Array, room_m: float, now_ns: int, speed_mps: float) -> float:
+        """Return the way along a path (N, 2) to where something is nearer than a room; inf without one.
+
+        What the base is near to already, and drives away from, does not count.
+        """
+        near_m = self.near_m(path, now_ns, speed_mps)
+        is_blocked = near_m < room_m
+        if is_blocked[0]:
+            leaves = np.minimum.accumulate(np.append(True, np.diff(near_m) > -ROUNDING_M))
+            is_blocked &= ~(leaves & np.minimum.accumulate(is_blocked))
+        return float(_ways_m(path)[np.argmax(is_blocked)]) if is_blocked.any() else math.inf
+
+
+def near_ends(pose: Array, ranges_m: Ranges, free_m: Ranges, collision: CollisionSettings) -> Array:
+    """Return the places (N, 2) near a pose (3,) where floor in view ends for the collision monitor, without a surface.
+
+    ranges_m, free_m (S,): of a scan from there. collision: the outline, in which nothing ends, and the distance within
+    which an end belongs to a surface, in any direction: along a wall, no ray shows floor up to it.
+    """
+    outline = Outline(collision.front_m, collision.rear_m, collision.half_width_m)
+    ends = unknown_ends(ranges_m.tolist(), free_m.tolist(), collision.stop_m)
+    azimuths = (np.arange(len(ranges_m)) + 0.5) * (math.tau / len(ranges_m)) - math.pi
+    directions = np.column_stack([np.cos(azimuths + pose[2]), np.sin(azimuths + pose[2])])
+    sectors = np.array([end.sector for end in ends], np.intp)
+    edges_m = [outline.edge_m(math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths[sectors]]
+    away_m = np.maximum([end.free_m for end in ends], edges_m)
+    is_seen, places = np.isfinite(ranges_m), away_m[:, None] * directions[sectors]
+    surfaces = ranges_m[is_seen, None] * directions[is_seen]
+    from_surface_m = np.linalg.norm(places[:, None] - surfaces, axis=2).min(axis=1, initial=math.inf)
+    return np.asarray(pose[:2] + places[(away_m < NEAR_M) & (from_surface_m > collision.stop_m)])
+
+
+def _ways_m(path: Array) -> Array:
+    """Return the way (N,) along a path (N, 2) to each of its points."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+
+
+def distances_m(flags: Flags) -> Array:
+    """Return the distance of each cell to the nearest one that is set [m]."""
+    if not flags.any():
+        return np.full(flags.shape, FAR_M)
+    return np.asarray(cv2.distanceTransform((~flags).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M, "f8")
+
+
+def _from_segments_m(points: Array, begin: Array, end: Array) -> Array:
+    """Return the distances (N, K) of points (N, 2) from segments between (K, 2), or between (N, K, 2)."""
+    along, to = end - begin, points[:, None] - begin
+    share = np.clip((to * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(to - share[..., None] * along, axis=-1))
