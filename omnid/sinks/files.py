@@ -86,8 +86,10 @@ class TrajectoryFile:
     def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
         """Write the row of a pose (4, 4). Raises OmnidError."""
         try:
-            row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
-            if self.opened().write(row) != len(row):
+            row, file = tum_row(stamp_ns, T).encode("ascii") + b"\n", self.opened()
+            written = file.write(row)
+            if written != len(row):
+                file.truncate(file.tell() - written)  # A part of a row is none.
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error

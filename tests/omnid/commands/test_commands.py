@@ -179,7 +179,7 @@ def test_export_writes_the_files_and_names_them(omap: Path, omnid: Command) -> N
     printed = omnid("map", "export", omap, *words).out
     assert all(str(path) in printed for path in a.values())
     assert len(read_ply(a["ply"]).xyz) > 50 and a["pgm"].read_bytes().startswith(b"P5\n")
-    assert "resolution: 0.1\n" in a["yaml"].read_text() and "image: a.pgm\n" in a["yaml"].read_text()
+    assert "resolution: 0.1\n" in a["yaml"].read_text() and 'image: "a.pgm"\n' in a["yaml"].read_text()
     # The loop is a line of its own colour in the plan.
     plan = cv2.imread(str(a["png"])).astype(int)
     assert np.count_nonzero(plan[..., 0] > plan[..., 2] + 100) > 20
