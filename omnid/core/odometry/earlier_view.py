@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.correlation import normalised_patches
 from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.patch_kernels import correlate
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -58,16 +58,16 @@ def contradicted(
     height, width = earlier.usable.shape
     columns, rows = np.nan_to_num(np.rint(seen)).astype(np.intp).T
     shown = earlier.usable[np.clip(rows, 0, height - 1), columns % width] & cylinder.shows(seen[:, 0])
-    for at in (pixels, seen):
-        shown &= np.abs(at[:, 1] - (height - 1) / 2) < height / 2 - HALF_PX
-    chosen = np.flatnonzero(shown)
+    chosen = np.flatnonzero(shown & (np.abs(seen[:, 1] - height / 2) < height))
     # 2. The correlations of both hypotheses there; they are one where the point has not moved in the image.
-    now, of_world, of_rig = (
-        normalised_patches(panorama, at[chosen], 2 * HALF_PX + 1)[0]
+    now, there, here = (
+        np.column_stack([panorama.padded(at[chosen, 0]), at[chosen, 1]])
         for panorama, at in ((lower, pixels), (earlier.lower, seen), (earlier.lower, pixels))
     )
-    by_world, by_rig = (now * of_world).sum(axis=1), (now * of_rig).sum(axis=1)
-    moved = np.hypot(lower.apart(seen[chosen, 0] - pixels[chosen, 0]), seen[chosen, 1] - pixels[chosen, 1]) > HALF_PX
+    of_world, of_rig = np.empty((2, len(chosen)))
+    for found, at in ((of_world, there), (of_rig, here)):
+        correlate(lower.image, earlier.lower.image, now, at, HALF_PX, found)
+    has_moved = np.hypot(lower.apart(there[:, 0] - here[:, 0]), there[:, 1] - here[:, 1]) > HALF_PX
     wrong = np.zeros(len(points), bool)
-    wrong[chosen] = (by_world < LEAST) | (moved & (by_rig > by_world))
+    wrong[chosen] = (of_world < LEAST) | (has_moved & (of_rig > of_world))
     return wrong
