@@ -12,7 +12,7 @@ from calib.panorama import Maps, remap_tables, visible
 from drivers.jpeg import Steps
 from omnid.config import PanoramaConfig
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.core.odometry.image_breaks import RawImage
+from omnid.core.odometry.line_times import RawImage
 from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
 from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
 from omnid.core.types.panorama import PaddedPanorama

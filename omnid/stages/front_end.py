@@ -16,7 +16,7 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.image_breaks import RawImage
+from omnid.core.odometry.line_times import RawImage
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -95,3 +96,20 @@ def repeat_lines(images: Sequence[Pixels], line: int, count: int, *, since: int)
     rows = np.arange(len(images[0]))
     source = np.where(rows < line, rows, np.clip(rows - count, 0, len(rows) - 1))
     return [image[source] if number >= since else image for number, image in enumerate(images)]
+
+
+def roll(images: Sequence[Pixels]) -> list[Pixels]:
+    """Return images whose rows are exposed one after the other, the last one by a period before the first.
+
+    They are warped by the dense flow from the image before, which the first one does not have.
+    """
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    height, width = images[0].shape
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    late = y / np.float32(height)
+    rolled = list(images[:1])
+    for before, now in pairwise(images):
+        back = flow.calc(now, before, np.zeros((height, width, 2), np.float32))
+        at = x - late * back[:, :, 0], y - late * back[:, :, 1]
+        rolled.append(np.asarray(cv2.remap(now, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8))
+    return rolled

@@ -22,7 +22,7 @@ from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
-from tests.replay.edited import Image, Pixels, dark, images, repeat_lines, save, shift, tear, turn
+from tests.replay.edited import Image, Pixels, dark, images, repeat_lines, roll, save, shift, tear, turn
 
 DARK_PAIRS = 20  # pairs, 2 s
 
@@ -146,6 +146,9 @@ CASES: Final = {
     "displaced, one camera": Case(
         ("upper",), lambda taken: shift(taken, (0, -4), since=SINCE), r"camera were displaced by \S+, -(3\.[89]|4\.)"
     ),
+    "displaced by a row, both": Case(
+        BOTH, lambda taken: shift(taken, (0, 1), since=SINCE), r"cameras were displaced by \S+, \+(0\.[89]|1\.)"
+    ),
     "lines missing": Case(
         BOTH, lambda taken: repeat_lines(taken, 128, -4, since=SINCE), "displaced by .* px below row 1[123]"
     ),
@@ -153,6 +156,10 @@ CASES: Final = {
         ("lower",),
         lambda taken: turn(taken, 1.0, since=SINCE),
         r"the lower camera were displaced by .* turned by -(0\.9|1\.0)",
+    ),
+    # The first image is not rolled, and left out.
+    "lines of both read one after another": Case(
+        BOTH, roll, r"cameras have rows that .* line time about -[345]\d\d us .* set", since=0
     ),
 }
 

@@ -17,8 +17,9 @@ from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import ROOM_M, OdometryEstimate, OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
-from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
+from omnid.core.odometry.image_breaks import ImageBreaks
 from omnid.core.odometry.keyframes import KeyframeLocaliser, Keyframes
+from omnid.core.odometry.line_times import LineTimes, RawImage
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, OtherMotion
@@ -89,7 +90,7 @@ class VisualOdometry:
         self._add_keyframe: Callable[[], None] | None = None  # the keyframe that the last frame asked for
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
         self._cost: tuple[float, int] | None = None  # of those in view, and their number; None: no pose was found
-        self.breaks = None if raw_images is None else ImageBreaks(model, raw_images)
+        self.breaks = None if raw_images is None else ImageBreaks(model, raw_images, LineTimes(model, raw_images))
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
@@ -262,6 +263,9 @@ class VisualOdometry:
                 is_sure=is_sure,
             )
             self._step = T_prev_curr if is_sure else None
+            if is_sure and self.breaks is not None:
+                velocity = se3.log(T_prev_curr) / now.dt_s
+                self.breaks.lines.add(now.frame.seq, estimate, self._map, velocity, now.dt_s)
         elif not now.is_measured:
             self._motion.reset()
         self._map.settle(at_previous)
