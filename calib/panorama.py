@@ -72,11 +72,6 @@ class Cylinder:
         """Return the azimuth of the left edge of column 0."""
         return math.pi - self.first / self.focal_px
 
-    @property
-    def edges_rad(self) -> tuple[float, float]:
-        """Return the azimuths of the left and of the right edge."""
-        return self.left_rad, self.left_rad - 2 * math.pi * (self.width / self.turn_px)
-
     def resized(self, width: int) -> Cylinder:
         """Return the panorama of about the same view in other columns."""
         scale = width / self.width

@@ -44,7 +44,7 @@ def test_a_sector_has_the_columns_of_what_both_cameras_see(
     cylinder = fit_cylinder(rig)
     span_deg = 360 * cylinder.width / cylinder.turn_px
     assert field_deg - CORNERS_DEG < span_deg < field_deg + 2 * STEP_DEG + 8 * CORNERS_DEG
-    middle = np.rad2deg(sum(cylinder.edges_rad) / 2) - heading_deg
+    middle = np.rad2deg(cylinder.azimuth(np.array([(cylinder.width - 1) / 2]))[0]) - heading_deg
     assert abs(math.remainder(middle, 360)) < STEP_DEG + CORNERS_DEG
     per_rad = np.linalg.norm(np.diff(camera.project(np.array([[-0.01, 0, 1], [0.01, 0, 1.0]])), axis=0)) / 0.02
     assert 0.7 * per_rad < cylinder.focal_px < 1.9 * per_rad
