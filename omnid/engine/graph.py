@@ -101,6 +101,7 @@ class _Link:
     depth: int
     drops: bool
     waiting: deque[object] = field(default_factory=deque)
+    has_ended: bool = False  # what comes later from outside would take the place of the end
 
 
 class _Inbox:
@@ -121,6 +122,10 @@ class _Inbox:
         with self._changed:
             if message is not END and not link.drops:
                 self._changed.wait_for(lambda: len(waiting) < link.depth)
+            if link.has_ended:
+                link.node.stats.dropped += 1
+                return
+            link.has_ended = message is END
             waiting.append(message)
             if message is not END and len(waiting) > link.depth:
                 waiting.popleft()

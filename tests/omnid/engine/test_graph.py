@@ -13,7 +13,7 @@ from itertools import count
 
 import pytest
 
-from omnid.engine.graph import Graph
+from omnid.engine.graph import END, Graph
 from omnid.engine.process import python
 
 LONG_S = 20.0  # a timeout that only a defect reaches
@@ -160,7 +160,7 @@ def test_a_stop_by_a_signal_drains_and_finishes(threaded: bool) -> None:
 
 STUCK = """
 import os, signal, time
-from omnid.engine.graph import Graph
+from omnid.engine.graph import END, Graph
 from omnid.engine.process import python
 
 def stuck(_):
@@ -249,6 +249,26 @@ def test_stages_of_one_thread_share_it_and_pass_messages_directly() -> None:
     assert last.got == beside.got and last.finished == beside.finished == 1, "nothing is dropped between the two"
     assert {thread for _, thread in seen} == {"shared"} and seen["first", "shared"] == seen["second", "shared"]
     assert {name for name, _ in seen} == {"first", "second", "other"}
+
+
+def test_a_message_from_outside_after_the_end_does_not_take_its_place() -> None:
+    graph, sink, has_ended = Graph(drops=True, depth=1), Collect(), threading.Event()
+    inlet = graph.inlet(1)
+
+    def slow(message: int) -> int:
+        has_ended.wait()
+        return message
+
+    def late(message: object) -> None:
+        if message is END:
+            inlet.push(2)
+            has_ended.set()
+
+    graph.sink("sink", sink, graph.stage("slow", slow, inlet))
+    inlet.readers.append(late)
+    graph.source("numbers", lambda: map(inlet.push, [1]))
+    graph.run()
+    assert sink.got == [1] and sink.finished == 1
 
 
 @both
