@@ -101,7 +101,6 @@ class _Link:
     depth: int
     drops: bool
     waiting: deque[object] = field(default_factory=deque)
-    has_ended: bool = False  # what comes later from outside would take the place of the end
 
 
 class _Inbox:
@@ -122,10 +121,9 @@ class _Inbox:
         with self._changed:
             if message is not END and not link.drops:
                 self._changed.wait_for(lambda: len(waiting) < link.depth)
-            if link.has_ended:
+            if waiting and waiting[-1] is END:  # from outside: it would take the place of the end
                 link.node.stats.dropped += 1
                 return
-            link.has_ended = message is END
             waiting.append(message)
             if message is not END and len(waiting) > link.depth:
                 waiting.popleft()
