@@ -5,7 +5,7 @@ such as the reflection of a lens in its mirror.
 
 Such a part is at the same rows of both panoramas whatever the base does: floor that falls deep beside the base would
 look so, too. As the base turns each heading shows another part of the world there, and what is fixed stays. With n
-headings whose normalised textures (core/obstacles/panoramas.py) have the mean m and the standard deviation s, a pixel
+headings whose normalised textures (core/obstacles/plane_view.py) have the mean m and the standard deviation s, a pixel
 is fixed where
 
     m sqrt(n) / s > T_0   and   m > m_0.
@@ -38,7 +38,7 @@ from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator
 from omnid.core.frames import of_base
-from omnid.core.obstacles.panoramas import AROUND_ROWS, DIRECTIONS, FOCAL_PX, TEXTURE_SHARE
+from omnid.core.obstacles.plane_view import AROUND_ROWS, DIRECTIONS, FOCAL_PX, TEXTURE_SHARE
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.errors import OmnidError
 from omnid.stages.front_end import FrontEnd

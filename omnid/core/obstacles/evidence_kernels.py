@@ -19,12 +19,24 @@ Numbers = NDArray[np.int32]
 
 LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
+UNITS = 12.0  # levels of a normalised image in one sigma, because 8 bits hold ten sigmas either way
+OUTLIER = np.uint8(4 * UNITS)  # Most units by which a pixel differs, because more than four sigmas are no noise.
+# Log-likelihood by a unit of difference of a direction: 1 by a sigma would be that of independent pixels; and of planes
+# beside the floor, which are compared in seven directions together, with weights of 64 in all.
+DIFFERENCE_SCALE, LEVEL_SCALE = np.float32(0.5 / UNITS), np.float32(1.5 / (64 * UNITS))
+# Log-likelihood by which the best of the deeper planes may fit better than the floor by noise, 1.5 in the mean of a
+# plain floor. With 3, by trial, bases stood on boards of 10 cm that are nearly alike.
+DEEP_NOISE = np.float32(10.0)
+STRIP_BOUND = np.float32(3.0)  # limit of the log-likelihood ratio of a strip
+STRIP_PRIOR = np.float32(0.5)  # log-odds by which a strip of a surface must exceed its other explanations
+# Probability of the floor in rows that may show it, by that of one disparity; and of a disparity below the floor, where
+# only holes are, and what a polished floor mirrors. By trial: of walls of bricks, which may be farther ones below the
+# floor, 94 % were found with 0.1 and 0.03, 92 % with 0.3, 66 % with 1.
+FLOOR_WEIGHT, BELOW_WEIGHT = np.float32(10.0), np.float32(0.1)
 # exp(x) is taken as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
 EXP_SHARE = np.float32(1 / 32)
 # Sums of likelihoods are never less than this share of one disparity's, so that ratios stay finite.
 LEAST_LIKELIHOOD = np.float32(1e-3)
-# Directions whose sums fit into the caches of a core, a divisor of panoramas.DIRECTIONS.
-PART = 96
 PATCH_FIRST, PATCH_END, PATCH_FROM, PATCH_LOW, PATCH_HIGH, PATCH_TO, PATCH_THIN = range(7)
 STRIP_FIRST, STRIP_END, STRIP_SURFACE, STRIP_SHIFTS, STRIP_FLOOR, STRIP_BELOW = range(6)
 
@@ -48,30 +60,14 @@ def bounded_band_pass(smooth: Floats, rows: int, most: np.float32, band: Floats)
 
 
 @inner
-def difference(lower: np.uint8, least: np.uint8, most: np.uint8, live: np.uint8, outlier: np.uint8) -> np.uint8:
-    """Return by how much a pixel lies outside of the bounds of another one, at most an outlier's; live: 255, else 0."""
-    above = np.uint8(lower - most) if lower > most else np.uint8(0)
-    below = np.uint8(least - lower) if least > lower else np.uint8(0)
-    found = above | below
-    return np.uint8((found if found < outlier else outlier) & live)
-
-
-@inner
-def add_differences(lower: Bytes, least: Bytes, most: Bytes, live: Bytes, outlier: np.uint8, sums: Words) -> None:
-    """Add to sums (W,) by how much a row lies outside of the bounds of another one, at most an outlier's."""
-    for u in range(len(sums)):
-        sums[u] = np.uint16(sums[u] + np.uint16(difference(lower[u], least[u], most[u], live[u], outlier)))
-
-
-@inner
-def add_between(
-    lower: Bytes, first: Bytes, second: Bytes, share: np.uint16, live: Bytes, outlier: np.uint8, sums: Words
-) -> None:
-    """Add to sums (W,) by how much a row differs from a place between two others; share: of the second one, of 256."""
-    rest = np.uint16(np.uint16(256) - share)
-    for u in range(len(sums)):
-        between = np.uint8(np.uint16(np.uint16(first[u]) * rest + np.uint16(second[u]) * share) >> np.uint16(8))
-        sums[u] = np.uint16(sums[u] + np.uint16(difference(lower[u], between, between, live[u], outlier)))
+def add_differences(lower: Bytes, least: Bytes, most: Bytes, live: Bytes, sums: Words, into: Words) -> None:
+    """Write sums (W,) and by how much a row lies outside of the bounds of another one, where it is live (255, else 0),
+    at most an outlier's."""
+    for u in range(len(into)):
+        above = np.uint8(lower[u] - most[u]) if lower[u] > most[u] else np.uint8(0)
+        below = np.uint8(least[u] - lower[u]) if least[u] > lower[u] else np.uint8(0)
+        found = above | below
+        into[u] = np.uint16(sums[u] + np.uint16(np.uint8((found if found < OUTLIER else OUTLIER) & live[u])))
 
 
 @inner
@@ -101,15 +97,16 @@ def spread(sums: Words, into: Words) -> None:
 
 
 @inner
-def add_next(sums: Words, count: int, into: Words) -> None:
-    """Write the sums (W,) of each direction and of those that follow it, so many together."""
+def subtract_together(sums: Words, before: Words, count: int, into: Words) -> None:
+    """Write the differences (W,) of sums and sums before of each direction and of those that follow it, so many
+    together."""
     width = len(sums)
-    into[:] = sums
-    for m in range(1, count):
+    into[:] = NOTHING
+    for m in range(count):
         for u in range(width - m):
-            into[u] = np.uint16(into[u] + sums[u + m])
+            into[u] = np.uint16(into[u] + np.uint16(sums[u + m] - before[u + m]))
         for u in range(width - m, width):
-            into[u] = np.uint16(into[u] + sums[u + m - width])
+            into[u] = np.uint16(into[u] + np.uint16(sums[u + m - width] - before[u + m - width]))
 
 
 @inner
@@ -119,25 +116,36 @@ def lower_to(values: Words, into: Words) -> None:
         into[u] = values[u] if values[u] < into[u] else into[u]
 
 
+@compiled("(u1[:, ::1], u1[:, :, ::1], u1[:, ::1], u2[:, :, ::1])", writes=("sums",))
+def sum_differences(lower: Bytes, bounds: Bytes, live: Bytes, sums: Words) -> None:
+    """Write the sums (D, H + 1, W), modulo 2^16, of the differences at D disparities in all rows above a row.
+
+    lower (H, W): normalised panorama; bounds (2, H, W): least and most of the upper one about each pixel; live (H, W):
+    255 where pixels may be compared, else 0. Rows without another one at a disparity add nothing.
+    """
+    height = len(lower)
+    for d in range(len(sums)):
+        sums[d, 0] = NOTHING
+        for v in range(height):
+            if v + d < height:
+                add_differences(lower[v], bounds[0, v + d], bounds[1, v + d], live[v], sums[d, v], sums[d, v + 1])
+
+
 @compiled(
-    "(u1[:, ::1], u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], f4[::1], i4[:, ::1], f4[:, :, ::1], f4[::1],"
-    " u1, f4, f4, f4, f4[:, ::1], f4[:, :, ::1])",
+    "(u1[:, ::1], u1[:, ::1], u1[:, ::1], u2[:, :, ::1], u2[:, ::1], f4[::1], i4[:, ::1], f4[:, :, ::1], f4[::1],"
+    " f4[:, ::1], f4[:, :, ::1])",
     writes=("others", "level"),
 )
 def floor_evidence(
     lower: Bytes,
     upper: Bytes,
-    upright: Bytes,
-    plane: Bytes,
     live: Bytes,
+    upright_sums: Words,
+    plane_sums: Words,
     plane_rows: Floats,
     patches: Numbers,
     offsets: Floats,
     prior: Floats,
-    outlier: np.uint8,
-    scale: np.float32,
-    level_scale: np.float32,
-    fit_of_noise: np.float32,
     others: Floats,
     level: Floats,
 ) -> None:
@@ -147,16 +155,15 @@ def floor_evidence(
     Where one of many deeper patches fits as well as the floor there is no evidence for it: a floor that repeats itself,
     and falls deep at an edge, fits at some range by another period. Against it counts what is beyond the fit of noise.
 
-    lower, upper (H, W): normalised panoramas; upright, plane (2, H, W): least and most of the upper one about each
-    pixel, and on the plane of the floor. live (H, W): 255 where pixels may be compared, else 0. plane_rows (H,): row of
-    the upper one that shows the floor of a row.
+    lower, upper (H, W): normalised panoramas. live (H, W): 255 where pixels may be compared, else 0. upright_sums (D,
+    H + 1, W), plane_sums (H + 1, W): of sum_differences, by disparity and on the plane of the floor. plane_rows (H,):
+    row of the upper one that shows the floor of a row.
     patches (K, 7): first row and end of the rows of the floor at that disparity, 0 and 0 for none; of the disparities
     the first, the last that is lower than the floor, the first that is higher, and the end; the directions that
     something thin hides: their mean is compared, of a direction and those that follow it.
     offsets (4, K, J): differences of disparity of planes that are the floor, above, just below and deeper, NaN: none;
     what is low is wide, and seven directions are compared. prior: weight of a disparity by its difference from the
-    floor's. outlier: most that a pixel differs; scale, level_scale: logarithm of the likelihood by a unit of
-    difference; fit_of_noise: log-likelihood by which the best of the deeper patches may fit better by noise.
+    floor's.
     """
     width = lower.shape[1]
     sums, floor, next_sums = np.empty(width, np.uint16), np.empty(width, np.uint16), np.empty(width, np.uint16)
@@ -169,82 +176,49 @@ def floor_evidence(
         # 1. Upright things at other disparities, of single thin ones.
         together = patches[k, PATCH_THIN]
         others[k], weights = NOTHING, NOTHING
-        sums[:] = 0
-        for v in range(first, end):
-            add_differences(lower[v], plane[0, v], plane[1, v], live[v], outlier, sums)
-        add_next(sums, together, floor)
+        subtract_together(plane_sums[end], plane_sums[first], together, floor)
         for d in range(patches[k, PATCH_FROM], patches[k, PATCH_TO]):
             if d <= patches[k, PATCH_LOW] or d >= patches[k, PATCH_HIGH]:
-                sums[:] = 0
-                for v in range(first, end):
-                    add_differences(lower[v], upright[0, v + d], upright[1, v + d], live[v], outlier, sums)
-                add_next(sums, together, next_sums)
-                add_likelihoods(next_sums, floor, scale / np.float32(together), prior[abs(d - k)], value, others[k])
+                subtract_together(upright_sums[d, end], upright_sums[d, first], together, sums)
+                scale = DIFFERENCE_SCALE / np.float32(together)
+                add_likelihoods(sums, floor, scale, prior[abs(d - k)], value, others[k])
                 weights += prior[abs(d - k)]
         others[k] /= weights
-        # 2. Planes.
+        # 2. Planes, in rows between two of the upper panorama.
         best[:] = LARGEST
         for kind in range(4):
             for offset in offsets[kind, k]:
                 if math.isnan(offset):
                     continue
-                sums[:] = 0
+                sums[:] = NOTHING
                 for v in range(first, end):
                     row = plane_rows[v] + offset
                     above = math.floor(row)
                     share = np.uint16((row - np.float32(above)) * np.float32(256.0))
-                    add_between(lower[v], upper[above], upper[above + 1], share, live[v], outlier, sums)
+                    rest = np.uint16(np.uint16(256) - share)
+                    for u in range(width):
+                        both = np.uint16(upper[above, u]) * rest + np.uint16(upper[above + 1, u]) * share
+                        between = np.uint8(np.uint16(both) >> np.uint16(8))
+                        other = lower[v, u]
+                        apart = np.uint8(other - between) if other > between else np.uint8(between - other)
+                        apart = (apart if apart < OUTLIER else OUTLIER) & live[v, u]
+                        sums[u] = np.uint16(sums[u] + np.uint16(apart))
                 spread(sums, next_sums)
                 spread(next_sums, sums)
                 spread(sums, next_sums)
                 lower_to(next_sums, best[kind])
         for u in range(width):
             floor_sum = np.float32(best[0, u])
-            level[0, k, u] = level_scale * (np.float32(best[1, u]) - floor_sum)
-            below = level_scale * (np.float32(best[2, u]) - floor_sum)
-            deep = level_scale * (np.float32(best[3, u]) - floor_sum)
-            deep = deep if deep > NOTHING else min(deep + fit_of_noise, NOTHING)
+            level[0, k, u] = LEVEL_SCALE * (np.float32(best[1, u]) - floor_sum)
+            below = LEVEL_SCALE * (np.float32(best[2, u]) - floor_sum)
+            deep = LEVEL_SCALE * (np.float32(best[3, u]) - floor_sum)
+            deep = deep if deep > NOTHING else min(deep + DEEP_NOISE, NOTHING)
             level[1, k, u] = min(below, deep)
 
 
 @inner
-def half_sums(
-    lower: Bytes, upright: Bytes, live: Bytes, rows: tuple[int, int], part: slice, outlier: np.uint8, sums: Bytes
-) -> None:
-    """Write the sums (D, PART) of differences over the rows from one to another, for D disparities, in a part."""
-    sums[:] = 0
-    for v in range(rows[0], rows[1]):
-        one, seen = lower[v, part], live[v, part]
-        for d in range(len(sums)):
-            least, most, into = upright[0, v + d, part], upright[1, v + d, part], sums[d]
-            # The compiler knows this count, unlike that of `add_differences`: a third of the time of all.
-            for u in range(PART):
-                into[u] = np.uint8(into[u] + difference(one[u], least[u], most[u], seen[u], outlier))
-
-
-@inner
-def has_run(before: Floats, mine: Floats, after: Floats, total: Floats, run: Floats) -> bool:
-    """True if a run of `add_run` has begun or may begin in some direction: else nothing changes there."""
-    found = np.int32(0)
-    for u in range(len(run)):
-        three = before[u] + mine[u] + after[u]
-        others = total[u] - three
-        others = others if others > LEAST_LIKELIHOOD else LEAST_LIKELIHOOD
-        found |= np.int32(run[u] > NOTHING) | np.int32(three + LEAST_LIKELIHOOD > others)
-    return bool(found > 0)
-
-
-@inner
 def add_run(
-    before: Floats,
-    mine: Floats,
-    after: Floats,
-    total: Floats,
-    blank: np.float32,
-    bound: np.float32,
-    prior: np.float32,
-    run: Floats,
-    best: Floats,
+    before: Floats, mine: Floats, after: Floats, total: Floats, blank: np.float32, run: Floats, best: Floats
 ) -> None:
     """Go on with the maximum-sum runs (W,) by a strip (Kadane), and raise `best` to them.
 
@@ -260,79 +234,46 @@ def add_run(
         ratio = np.float32(2.0) * (root - ONE / root)
         without = ratio + blank
         ratio = ratio if ratio > NOTHING else (without if without < NOTHING else NOTHING)
-        ratio = ratio if ratio < bound else bound
-        ratio = ratio if ratio > -bound else -bound
-        value = run[u] + ratio - prior
+        ratio = ratio if ratio < STRIP_BOUND else STRIP_BOUND
+        ratio = ratio if ratio > -STRIP_BOUND else -STRIP_BOUND
+        value = run[u] + ratio - STRIP_PRIOR
         value = value if value > NOTHING else NOTHING
         run[u] = value
         best[u] = value if value > best[u] else best[u]
 
 
-@compiled(
-    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4, f4[:, ::1])",
-    writes=("surface",),
-)
-def surface_evidence(
-    lower: Bytes,
-    upright: Bytes,
-    plane: Bytes,
-    live: Bytes,
-    strips: Numbers,
-    outlier: np.uint8,
-    scale: np.float32,
-    floor_weight: np.float32,
-    below_weight: np.float32,
-    bound: np.float32,
-    prior: np.float32,
-    surface: Floats,
-) -> None:
+@compiled("(u2[:, :, ::1], u2[:, ::1], i4[:, ::1], f4[:, ::1])", writes=("surface",))
+def surface_evidence(upright_sums: Words, plane_sums: Words, strips: Numbers, surface: Floats) -> None:
     """Write the best run (K, W) of strips of rows that are a surface, as a log-likelihood ratio.
 
-    Images as for floor_evidence. strips (N, 6), from above: first row and end, of which the second half is the first
-    half of the next strip; first disparity that is a surface within the robot's heights, and end of the disparities,
-    which never rises; 1 where the floor is an explanation, too; end of the disparities that lie below the floor.
-    outlier: as for floor_evidence; half of a strip's rows times it is less than 256.
-    floor_weight, below_weight: probability of the floor, and of a disparity below it, by that of one above it; bound:
-    of the ratio of a strip; prior: less ratio.
+    Sums as for floor_evidence. strips (N, 6), from above: first row and end; first disparity that is a surface within
+    the robot's heights, and end of the disparities, which never rises; 1 where the floor is an explanation, too; end of
+    the disparities that lie below the floor.
     """
-    width, bins = lower.shape[1], len(surface)
-    halves, floor = np.empty((2, bins, PART), np.uint8), np.empty(PART, np.uint16)
-    sums, best = np.empty((bins, PART), np.uint16), np.empty(PART, np.uint16)
-    value, total = np.empty((bins + 2, PART), np.float32), np.empty(PART, np.float32)
-    run, plain = np.empty((bins, PART), np.float32), np.empty(PART, np.float32)
+    bins, width = surface.shape
+    sums, floor, best = np.empty((bins, width), np.uint16), np.empty(width, np.uint16), np.empty(width, np.uint16)
+    value, total = np.zeros((bins + 2, width), np.float32), np.empty(width, np.float32)
+    run, plain = np.zeros((bins, width), np.float32), np.empty(width, np.float32)
     surface[:] = NOTHING
-    for begin in range(0, width, PART):
-        part = slice(begin, begin + PART)
-        run[:], value[0] = NOTHING, NOTHING
-        for n in range(len(strips)):
-            first, end = strips[n, STRIP_FIRST], strips[n, STRIP_END]
-            mine, last, below = strips[n, STRIP_SURFACE], strips[n, STRIP_SHIFTS], strips[n, STRIP_BELOW]
-            # 1. The differences of both halves.
-            middle = (first + end) // 2
-            if n == 0:
-                half_sums(lower, upright, live, (first, middle), part, outlier, halves[0, :last])
-            half_sums(lower, upright, live, (middle, end), part, outlier, halves[(n + 1) % 2, :last])
-            best[:], total[:], value[last + 1] = LARGEST, NOTHING, NOTHING
-            for d in range(last):
-                for u in range(PART):
-                    sums[d, u] = np.uint16(np.uint16(halves[0, d, u]) + np.uint16(halves[1, d, u]))
-                lower_to(sums[d], best)
-            # 2. The likelihoods of the floor and of all disparities.
-            weights = below * below_weight + (last - below)
-            if strips[n, STRIP_FLOOR] > 0:
-                floor[:] = 0
-                for v in range(first, end):
-                    seen = live[v, part]
-                    add_differences(lower[v, part], plane[0, v, part], plane[1, v, part], seen, outlier, floor)
-                lower_to(floor, best)
-                add_likelihoods(floor, best, scale, floor_weight, plain, total)
-                weights += floor_weight
-            for d in range(last):
-                add_likelihoods(sums[d], best, scale, below_weight if d < below else ONE, value[d + 1], total)
-            # 3. The runs.
-            fourth = math.pow((weights - 3.0) / 3.0, 0.25)
-            blank = np.float32(2.0 * (fourth - 1.0 / fourth))
-            for d in range(mine, last):
-                if has_run(value[d], value[d + 1], value[d + 2], total, run[d]):
-                    fits = value[d], value[d + 1], value[d + 2]
-                    add_run(*fits, total, blank, bound, prior, run[d], surface[d, part])
+    for n in range(len(strips)):
+        first, end = strips[n, STRIP_FIRST], strips[n, STRIP_END]
+        mine, last, below = strips[n, STRIP_SURFACE], strips[n, STRIP_SHIFTS], strips[n, STRIP_BELOW]
+        # 1. The differences, and the least of them.
+        best[:], total[:], value[last + 1] = LARGEST, NOTHING, NOTHING
+        for d in range(last):
+            subtract_together(upright_sums[d, end], upright_sums[d, first], 1, sums[d])
+            lower_to(sums[d], best)
+        # 2. The likelihoods of the floor and of all disparities.
+        weights = below * BELOW_WEIGHT + (last - below)
+        if strips[n, STRIP_FLOOR] > 0:
+            subtract_together(plane_sums[end], plane_sums[first], 1, floor)
+            lower_to(floor, best)
+            add_likelihoods(floor, best, DIFFERENCE_SCALE, FLOOR_WEIGHT, plain, total)
+            weights += FLOOR_WEIGHT
+        for d in range(last):
+            add_likelihoods(sums[d], best, DIFFERENCE_SCALE, BELOW_WEIGHT if d < below else ONE, value[d + 1], total)
+        # 3. The runs.
+        fourth = math.pow((weights - 3.0) / 3.0, 0.25)
+        blank = np.float32(2.0 * (fourth - 1.0 / fourth))
+        for d in range(mine, last):
+            add_run(value[d], value[d + 1], value[d + 2], total, blank, run[d], surface[d])

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
-from omnid.core.obstacles.column import THIN_M
 from omnid.core.obstacles.moving_tracker import Arrivals
-from omnid.core.obstacles.panoramas import AZIMUTHS
+from omnid.core.obstacles.plane_view import AZIMUTHS, THIN_M
 from omnid.core.obstacles.posterior import RayBelief
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ down, something that hangs over floor in view, or nothing up to the last bin. Bi
 1. Steps of grey e across the bins of the floor, and its greys. Floor: (1 - m) N(e; s_r) + m Laplace(e; b g),
    with its sigma s_r at that range and its rate of marks m; what is behind something: the same with a rate m_h, with
    texture or without; where something begins: Laplace(e; b g). So a plain bin speaks against a beginning.
-2. Ratios of floor, surfaces and planes beside the floor, from stereo (column.py).
+2. Ratios of floor, surfaces and planes beside the floor, from stereo (plane_view.py).
 3. Look of the floor: contrast, grey and outline of a bin, by those of floor that is known. Beyond the
    border of a patch of sun, or of another covering, it may look otherwise.
 4. The posterior (ray_kernels.posterior): sums along the ray. The end of the floor beyond the last bin shows a foot,
@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
-from omnid.core.obstacles.bins import BINS_PER_PX, Bins, ShownBins, pooled, turned
-from omnid.core.obstacles.panoramas import AZIMUTHS, DIRECTIONS
+from omnid.core.obstacles.plane_view import AZIMUTHS, BINS_PER_PX, DIRECTIONS, Bins, ShownBins, pooled, turned
 from omnid.core.obstacles.ray_kernels import RayParameters
 
 Array = NDArray[np.float64]

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled
-from omnid.core.obstacles.column import OUTLIER, FloorPlane
-from omnid.core.obstacles.panoramas import AZIMUTHS, FOCAL_PX, UNITS, Views, WorkingPanoramas
+from omnid.core.obstacles.evidence_kernels import OUTLIER, UNITS
+from omnid.core.obstacles.plane_view import AZIMUTHS, BOUNDED_SIGMAS, FOCAL_PX, FloorPlane, PlaneView, WorkingPair
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -35,7 +35,7 @@ STARTS_M: Final = np.arange(0.6, 3.3, 0.1)  # where ramps are looked for: nearer
 SEEN_M: Final = 4.0  # range up to which they are seen
 HALF_RAD: Final = math.radians(27.0)  # half of the angle in which a ramp is as wide as the way
 PARTS: Final = 8  # of that angle: most of them must show a ramp
-# Log-likelihood by a sigma of difference of a pixel: that of column.py with the weight that the posterior gives it.
+# Log-likelihood by a sigma of difference of a pixel: that of evidence_kernels.py with its weight in the posterior.
 RATIO: Final = 0.075
 LEAST_NATS: Final = 10.0  # Evidence of a ramp in one pair: without one it is below 4 in textured corridors.
 SAME_M, SAME = 0.5, math.tan(math.radians(3.0))  # within which pairs show the same ramp
@@ -139,20 +139,10 @@ class Ramps:
             return None
         return Ramp(self.offset_m - self._along(viewpoint, self.way_rad), self._slope, self.way_rad + turn_rad)
 
-    def search(
-        self,
-        views: Views,
-        panoramas: WorkingPanoramas,
-        height_m: float,
-        baseline_m: float,
-        viewpoint: Array,
-        turn_rad: float,
-        climbed: float,
-    ) -> bool:
-        """Search for a ramp ahead in a pair whose views are normalised for floor; return whether it is a new one.
+    def search(self, pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: float, climbed: float) -> bool:
+        """Search for a ramp ahead in a pair on the floor before it; return whether it is a new one.
 
-        height_m: of the viewpoint over the floor before the ramp. viewpoint: x, y, heading in odom; turn_rad: of odom
-        in the rectified frame; climbed: slope of the base in odom.
+        viewpoint: x, y, heading in odom; turn_rad: of odom in the rectified frame; climbed: slope of the base in odom.
         """
         # 1. Gains of all ramps in parts of the way.
         aside = np.angle(np.exp(1j * (AZIMUTHS - viewpoint[2] - turn_rad)))
@@ -163,16 +153,17 @@ class Ramps:
         if climbed > GENTLEST:  # A landing is level.
             slopes = np.append(slopes, STEP * np.arange(-2, 3) - climbed)
         ramps = np.empty((PARTS, len(STARTS_M), len(slopes)))
-        upright = np.empty((PARTS, math.ceil(FOCAL_PX * baseline_m / STARTS_M[0]), panoramas.height))
-        images = views.lower, views.upper, views.live, panoramas.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
-        geometry = panoramas.row0, FOCAL_PX, height_m, baseline_m, SEEN_M
+        upright = np.empty((PARTS, math.ceil(view.at_1m / STARTS_M[0]), view.height))
+        live, height_m = pair.seen * np.uint8(255), view.plane.height_m
+        images = *pair.normalised(BOUNDED_SIGMAS), live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
+        geometry = view.row0, FOCAL_PX, height_m, view.at_1m / FOCAL_PX, SEEN_M
         gains(*images, *geometry, STARTS_M, slopes, OUTLIER, ramps, upright)
         # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
         sums = np.pad(np.cumsum(upright, axis=2), ((0, 0), (0, 0), (1, 0)))
         below_m = height_m + np.outer(STARTS_M, slopes)
-        far = np.ceil(panoramas.row0 + FOCAL_PX * (below_m / SEEN_M - slopes)).astype(int)
-        near = np.floor(panoramas.row0 + FOCAL_PX * height_m / STARTS_M).astype(int)[:, None]
-        ends = (np.clip(rows, int(panoramas.row0), panoramas.height) for rows in (near + 1, far))
+        far = np.ceil(view.row0 + FOCAL_PX * (below_m / SEEN_M - slopes)).astype(int)
+        near = np.floor(view.row0 + FOCAL_PX * height_m / STARTS_M).astype(int)[:, None]
+        ends = (np.clip(rows, int(view.row0), view.height) for rows in (near + 1, far))
         things = np.subtract(*(sums[:, :, rows] for rows in ends)).max(axis=1)
         # 3. The likeliest, which most parts show. Every second direction was looked at.
         nats = 2 * RATIO / UNITS * PARTS * np.median(ramps - np.maximum(things, 0), axis=0)

@@ -12,7 +12,7 @@ its own pose says where both are.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import cv2
 import numpy as np
@@ -21,10 +21,17 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from calib.se2_arrays import planar, transform
-from omnid.core.obstacles.bins import Bins, PlaneView
-from omnid.core.obstacles.column import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.obstacles.grid import GridScan, ObstacleGrid, unknown_scan
-from omnid.core.obstacles.panoramas import AROUND_ROWS, AZIMUTHS, FOCAL_PX, WorkingPair
+from omnid.core.obstacles.plane_view import (
+    AROUND_ROWS,
+    AZIMUTHS,
+    FOCAL_PX,
+    Bins,
+    FloorPlane,
+    PlaneView,
+    WorkingPair,
+    floor_plane,
+)
 from omnid.core.obstacles.posterior import RayBelief, RayPosterior
 from omnid.core.obstacles.ramps import Ramp, Ramps
 from omnid.core.obstacles.ray_kernels import RayParameters
@@ -47,13 +54,6 @@ FOUND_M: Final = 1.0  # A ramp that begins nearer is known: what is left of the 
 PARAMETERS: Final = RayParameters()
 
 
-class _Plane(NamedTuple):
-    """A plane of the floor, and the tables of it."""
-
-    plane: FloorPlane
-    view: PlaneView
-
-
 class RayScans:
     """Scans of a run by the rays of its pairs."""
 
@@ -62,6 +62,7 @@ class RayScans:
         self.grid = ObstacleGrid(FOCAL_PX * baseline_m, settings.max_range_m)
         # Tilt (2,) beyond what the rig states by all pairs, its covariance, and that of the tables.
         self._tilt, self._P, self._used = np.zeros(2), PRIOR_RAD**2 * np.eye(2), np.zeros(2)
+        self._bins: Bins | None = None
         self._followed_ns: int | None = None  # stamp of the last pair by which tilt and ramps were followed
         self._ramps = Ramps()
         self._way = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
@@ -73,11 +74,10 @@ class RayScans:
         self._T_odom_floor = np.eye(4)  # pose of the base when it stood on the floor before a ramp
         self.grid.set_floor(T_rect_base)
         self._ramps.forget()
-        plane = floor_plane(T_rect_base)
-        columns = self._columns(plane)
-        self._bins = Bins(columns)
+        self._bins = None
+        self._floor = self._ramp = self._view(floor_plane(T_rect_base))
+        self._bins = self._floor.bins
         self._posterior = RayPosterior(self._bins, PARAMETERS)
-        self._floor = self._ramp = _Plane(plane, PlaneView(columns, self._bins, PARAMETERS))
 
     def begin_again(self) -> None:
         """Forget what is known in odom, as the way since then is not."""
@@ -105,21 +105,17 @@ class RayScans:
         floor = floor_plane(self._T_rect_base @ se3.inverse(T_odom_base) @ self._T_odom_floor)
         floor = FloorPlane(floor.height_m, floor.a + float(self._used[0]), floor.b + float(self._used[1]))
         self._floor = self._seen(floor, self._floor)
-        if not self._floor.view.shows_floor:
+        if not self._floor.shows_floor:
             return unknown_scan()
         # 2. What the pair shows on them.
-        columns = self._floor.view.columns
-        pair = columns.panoramas.pair(lower, upper, lost)
-        views = columns.panoramas.views(pair)
-        shown = self._floor.view.shown(pair, columns.evidence(*views))
+        pair = self._floor.pair(lower, upper, lost)
+        shown = self._floor.shown(pair, PARAMETERS)
         if ramp is not None:
-            self._ramp = self._seen(ramp.plane(floor), self._ramp, is_ramp=True)
-            columns = self._ramp.view.columns
-            on_ramp = columns.panoramas.pair(lower, upper, lost)
-            evidence = columns.evidence(*columns.panoramas.views(on_ramp))
-            shown = shown.beyond(ramp.begins_before(self._bins.ranges_m), self._ramp.view.shown(on_ramp, evidence))
+            self._ramp = self._seen(ramp.plane(floor), self._ramp)
+            on_ramp = self._ramp.shown(self._ramp.pair(lower, upper, lost), PARAMETERS)
+            shown = shown.beyond(ramp.begins_before(self._floor.bins.ranges_m), on_ramp)
         # 3. The belief, with the look of floor that is known, and the grid.
-        known = self.grid.is_floor(pose, self._bins.ranges_m)
+        known = self.grid.is_floor(pose, self._floor.bins.ranges_m)
         self.belief = self._posterior.belief(shown, pair.sensor_grey, known)
         scan = self.grid.update(stamp_ns, pose, self.belief)
         # 4. Tilt and ramps, for the next pair.
@@ -128,28 +124,26 @@ class RayScans:
             self._observe_tilt(pose, pair, ramp)
         if is_due:
             self._followed_ns = stamp_ns
-        is_sure = np.diag(self._P).max() < SURE_RAD**2  # A rig that leans shows a slope everywhere.
-        if is_due and is_sure and (ramp is None or ramp.start_m > FOUND_M):
-            geometry, climbed = (floor.height_m, self._baseline_m), float(T_odom_base[2, 0])
-            panoramas = self._floor.view.columns.panoramas
-            if self._ramps.search(views[1], panoramas, *geometry, viewpoint, turn_rad, climbed):
-                # What was seen beyond its start was compared with another floor.
-                self.grid.forget_beyond(self._ramps.way_rad, self._ramps.offset_m)
+        # A rig that leans shows a slope everywhere.
+        is_due = is_due and np.diag(self._P).max() < SURE_RAD**2 and (ramp is None or ramp.start_m > FOUND_M)
+        if is_due and self._ramps.search(pair, self._floor, viewpoint, turn_rad, float(T_odom_base[2, 0])):
+            # What was seen beyond its start was compared with another floor.
+            self.grid.forget_beyond(self._ramps.way_rad, self._ramps.offset_m)
         return scan
 
     def _observe_tilt(self, pose: Array, pair: WorkingPair, ramp: Ramp | None) -> None:
         """Take a pair into the filter of the tilt, by near floor that is known; pose (4, 4): of the base, planar."""
         self._P = self._P + DRIFT_RAD**2 * np.eye(2)
-        columns, height_m = self._floor.view.columns, self._floor.plane.height_m
-        ranges_m = FOCAL_PX * height_m / np.maximum(np.arange(columns.panoramas.height) - columns.panoramas.row0, 1e-6)
-        rows = np.flatnonzero((ranges_m < LEAN_M) & (columns.panoramas.plane_rows < columns.last_row - 2))
+        view, height_m = self._floor, self._floor.plane.height_m
+        ranges_m = FOCAL_PX * height_m / np.maximum(np.arange(view.height) - view.row0, 1e-6)
+        rows = np.flatnonzero((ranges_m < LEAN_M) & (view.plane_rows < view.last_row - 2))
         known = self.grid.is_floor(pose, ranges_m[rows]) & pair.seen[rows]
         if ramp is not None:
             known &= ~ramp.begins_before(ranges_m[rows])
         if not known.any():
             return
         # 1. Difference and gradient of both views on the plane.
-        at = columns.panoramas.plane_rows[rows]
+        at = view.plane_rows[rows]
         lower, upper = (image - cv2.blur(image, (1, AROUND_ROWS)) for image in (pair.lower, pair.upper))
         above, share = np.floor(at).astype(int), (at % 1)[:, None]
         both = np.stack([upper, (np.roll(upper, -1, 0) - np.roll(upper, 1, 0)) / 2])
@@ -174,14 +168,10 @@ class RayScans:
         if np.abs((self._tilt - self._used)[is_sure]).max(initial=0.0) > LEAST_RAD:
             self._used = np.where(is_sure, self._tilt, self._used)
 
-    def _columns(self, plane: FloorPlane, *, is_ramp: bool = False) -> Columns:
-        """Return the stereo evidence on a plane."""
-        heights_m, ranges_m = self._settings.heights_m, (NEAREST_M, self._settings.max_range_m)
-        return Columns(self._cylinder, self._baseline_m, plane, heights_m, ranges_m, self._visible, is_ramp=is_ramp)
+    def _view(self, plane: FloorPlane) -> PlaneView:
+        return PlaneView(self._cylinder, self._baseline_m, plane, self._settings, self._visible, self._bins)
 
-    def _seen(self, plane: FloorPlane, before: _Plane, *, is_ramp: bool = False) -> _Plane:
-        """Return a plane with its tables, those of a plane before where it is about the same."""
+    def _seen(self, plane: FloorPlane, before: PlaneView) -> PlaneView:
+        """Return the view of a plane, that of a plane before where it is about the same."""
         height_m, *slopes = np.abs(np.subtract(plane, before.plane))
-        if height_m < LEAST_M and max(slopes) < LEAST_RAD:
-            return before
-        return _Plane(plane, PlaneView(self._columns(plane, is_ramp=is_ramp), self._bins, PARAMETERS))
+        return before if height_m < LEAST_M and max(slopes) < LEAST_RAD else self._view(plane)
