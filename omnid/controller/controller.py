@@ -36,11 +36,11 @@ class Controller:
         *,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         limited: Callable[[VelocityCommand], tuple[float, float]] | None = None,
-        boot_s: float | None = None,
+        is_awaited: bool = False,
     ) -> None:
         """report: takes lines for the log. clock_ns: the clock of the poses' stamps.
 
-        boot_s: time for which a motor controller that has not answered yet may boot; None: it has answered.
+        is_awaited: the motor controller has not answered yet.
 
         limited: velocity [m/s] and yaw rate [rad/s] that the driver makes of a command; None: those of the command.
         """
@@ -48,12 +48,11 @@ class Controller:
         self._limited = limited or (lambda command: (command.velocity_mps, command.yaw_rate_radps))
         self._period_ns = round(period_s * 1e9)
         self._law = ControlLaw(settings, self._clock_ns())
-        self._boots_until_ns = self._clock_ns() + round((boot_s or 0.0) * 1e9)
         self._last_ns = 0  # the last tick
         self.due_ns = 0  # when the next one is due (CLOCK_MONOTONIC); 0: at once
         self._driven_ns = 0  # capture of the newest pose that a command has followed from
         self._motor_stopped = False  # True if the motor controller stopped by itself before the last tick
-        self.state = ControllerState(failed=boot_s is not None)
+        self.state = ControllerState(failed=is_awaited)
 
     @property
     def is_at_rest(self) -> bool:
@@ -80,46 +79,45 @@ class Controller:
         self._law.ending = True
 
     def tick(self) -> TickReport:
-        """Step the law and send its motion."""
-        # 1. Step the law.
+        """Step the law, and send its motion."""
+        state, law = self.state, self._law
+        # 1. Keep the rhythm of the earliest tick; ticks whose time has passed are left out.
         now_ns = self._clock_ns()
-        dt_s, late_s = self._keep_rhythm(now_ns)
-        output = self._law.step(now_ns, dt_s, late_s=late_s, motor=self._motor_reason())
-        # 2. Keep its state for the status, and report what has changed.
+        dt_ns = now_ns - self._last_ns if self._last_ns else self._period_ns
+        due_ns = min(self.due_ns or now_ns, now_ns)
+        missed = (now_ns - due_ns) // self._period_ns
+        self._last_ns, self.due_ns = now_ns, due_ns + (1 + missed) * self._period_ns
+        state.missed += missed
+        # 2. Step the law, which is told what became of the last command; keep and report what has changed.
+        motor, late_s = STOPPED if self._motor_stopped else "", (now_ns - due_ns) * S_PER_NS
+        if state.failed:
+            motor = FAILED if state.sent else AWAITED
+        output = law.step(now_ns, dt_ns * S_PER_NS, late_s=late_s, motor=motor)
         self._keep_state(output.reason)
-        # 3. Send its motion, and report to the law whether it was sent.
+        # 3. Send its motion, and report to the law what became of it.
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
-        self._law.plausibility.add_command(now_ns, STOP if self.state.failed else Twist(*self._limited(command)))
+        law.plausibility.add_command(now_ns, STOP if state.failed else Twist(*self._limited(command)))
+        to_wheel_s, wheels = math.nan, None
         if status is not None:
             self._take_status(status, now_ns)
-        # 4. Report times, and the motion that the wheels have measured.
+            if math.isfinite(status.velocity_mps):
+                wheels = WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps)
+        # 4. Report times: the age of images where this command is the first that follows from them.
         done_ns = self._clock_ns()
-        to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
-        is_known = status is not None and math.isfinite(status.velocity_mps)
-        wheels = WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps) if status and is_known else None
-        return TickReport(
-            None if status is None else command, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s, self.state, wheels
-        )
+        if status is not None and law.pose is not None and law.pose.stamp_ns > self._driven_ns:
+            self._driven_ns = law.pose.stamp_ns
+            to_wheel_s = (done_ns - self._driven_ns) * S_PER_NS
+        accepted = None if status is None else command
+        return TickReport(accepted, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s, state, wheels)
 
     def close(self) -> None:
         """Stop the wheels at once and release the driver."""
         self._driver.close()
 
-    def _keep_rhythm(self, now_ns: int) -> tuple[float, float]:
-        """Return the seconds since the last tick, and the lateness of this one against the rhythm of the earliest."""
-        dt_ns = now_ns - self._last_ns if self._last_ns else self._period_ns
-        self._last_ns = now_ns
-        due_ns = min(self.due_ns or now_ns, now_ns)
-        missed = (now_ns - due_ns) // self._period_ns
-        self.due_ns = due_ns + (1 + missed) * self._period_ns
-        self.state.missed += missed
-        return dt_ns * S_PER_NS, (now_ns - due_ns) * S_PER_NS
-
     def _keep_state(self, reason: str) -> None:
         """Keep what the law has decided, for the status; count and report what has changed since the last tick."""
         state, law, before = self.state, self._law, copy(self.state)
-        # 1. What holds now.
         state.reason = reason
         arming, commands, monitor = law.arming, law.commands, law.collision
         state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, arming.answer
@@ -132,15 +130,8 @@ class Controller:
         state.blocked = bool(state.obstacle) and monitor.holds
         if cuts_drive_short(before, state):
             state.stops[reason] += 1
-        # 2. Lines for a person.
         for line in transitions(before, state, law.plausibility.conflict):
             self._report(line)
-
-    def _motor_reason(self) -> str:
-        """Return what became of the last command, where that is a reason to stop."""
-        if self.state.failed:
-            return FAILED if self.state.sent else AWAITED
-        return STOPPED if self._motor_stopped else ""
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:
         """Send the command; return the motor controller's answer, None where it gave none."""
@@ -155,12 +146,11 @@ class Controller:
             if problem != state.problem:
                 self._report(problem if state.sent else f"{AWAITED}: {problem}")
             state.failed, state.problem, state.errors = True, problem, state.errors + 1
-            state.overdue = not state.sent and command.stamp_ns > self._boots_until_ns
             self._law.motion = STOP  # its own watchdog stops a motor controller that receives nothing
             return None
         if state.problem:
             self._report("the motor controller is back" if state.sent else "the motor controller answers")
-        state.failed, state.problem, state.overdue = False, "", False
+        state.failed, state.problem = False, ""
         state.sent += 1
         return status
 
@@ -176,11 +166,3 @@ class Controller:
         yaw_rate_radps = math.nan if math.isfinite(status.heading_rad) else status.yaw_rate_radps
         motion = Motion(status.velocity_mps, yaw_rate_radps)
         self._law.plausibility.add_report(now_ns, motion, status.fault, status.battery_v)
-
-    def _to_wheel_s(self, done_ns: int) -> float:
-        """Return the age of the pose's images where this command is the first that follows from them, else NaN."""
-        pose = self._law.pose
-        if pose is None or pose.stamp_ns <= self._driven_ns:
-            return math.nan
-        self._driven_ns = pose.stamp_ns
-        return (done_ns - pose.stamp_ns) * S_PER_NS

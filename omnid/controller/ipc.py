@@ -82,7 +82,6 @@ class ControllerState:
     source: str = ""  # source of the commands that drive; empty while none does
     failed: bool = False  # the last command failed
     problem: str = ""  # why, in words
-    overdue: bool = False  # the motor controller has not answered within its time to boot
     fault: int = 0  # the motor controller's own number
     battery_v: float = math.nan  # voltage that the motor controller reports
     slowed_by: str = ""  # why the base drives slowly; empty: it need not
@@ -112,16 +111,13 @@ def transitions(before: ControllerState, after: ControllerState, conflict: Confl
     answer, last = after.arm_answer, before.arm_answer
     if answer != last and (not answer.refusal or answer.refusal != last.refusal):
         yield f"arming is refused: {answer.refusal}" if answer.refusal else ARMED
-    # 2. A fault while the wheels are at rest, which ends no drive.
-    if before.armed and after.needs_request and before.reason:
-        yield f"disarmed while the wheels are stopped: {after.disarmed_by}; {UNTIL_ARMED}"
-    # 3. A reason to drive slowly that a person should examine.
+    # 2. A reason to drive slowly that a person should examine.
     if after.slowed_by != before.slowed_by and after.slowed_by in (MOTION_DOUBTFUL, *CONFLICTS):
         yield f"the wheels turn slowly: {after.slowed_by}{_detail(after.slowed_by, conflict)}"
-    # 4. A stop by the collision monitor.
+    # 3. A stop by the collision monitor.
     if after.blocked and not before.blocked:
         yield f"the wheels stop: {after.obstacle}; {remedy(after.obstacle)}"
-    # 5. The end of a drive, unless it was asked for.
+    # 4. The end of a drive, unless it was asked for.
     if cuts_drive_short(before, after) and after.reason != ENDS:
         latched = f"; {UNTIL_ARMED}" if after.needs_request else ""
         advice = f"; {ADVICE}" if after.reason in DISAGREEMENTS else ""

@@ -30,11 +30,11 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.graph import Stream
 from omnid.engine.process import python, python_environment
 from omnid.engine.telemetry import Histogram, StageStats
+from omnid.engine.threads import POLL_S
 from omnid.errors import OmnidError
 
 START_S: Final = 30.0  # of the process, beyond the time in which the motor controller may boot
 END_S: Final = LONGEST_RAMP_S + 2.0
-RECEIVE_S: Final = 0.5
 PROCESS: Final = "omnid.controller.process"
 
 
@@ -150,7 +150,7 @@ class ControllerLink:
         since_ns = time.monotonic_ns()  # the process has ticked, with the wheels stopped, since before the stages began
         with suppress(EOFError):
             while not self._ended_ns or (time.monotonic_ns() - self._ended_ns) * S_PER_NS <= END_S:
-                message = self._receive(RECEIVE_S)
+                message = self._receive(POLL_S)
                 if isinstance(message, TickReport) and message.command and message.command.stamp_ns >= since_ns:
                     yield message.command
         self._require_asked_end()

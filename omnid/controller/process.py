@@ -50,7 +50,7 @@ def run_controller(channel: Channel) -> int:
             1.0 / start.motor.rate_hz,
             lambda text: channel.send(LogRecord(text)),
             limited=start.motor.drive.limited,
-            boot_s=None if start.waits else start.motor.boot_s,
+            is_awaited=not start.waits,
         )
         run_until_end(channel, controller)
     return 0

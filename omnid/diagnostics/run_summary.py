@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -17,7 +15,7 @@ from drivers.frame import CAMERAS
 from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import SIDES, Side
-from omnid.engine.logging_setup import HANDLER, log
+from omnid.engine.logging_setup import HANDLER
 from omnid.engine.telemetry import SummaryRow
 from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
@@ -123,72 +121,63 @@ def run_summary(entries: Mapping[str, str], timings: Iterable[SummaryRow] = ()) 
 
 
 class Progress:
-    """Shows how far a run over a log is: a line that a terminal keeps showing, else one each five seconds."""
+    """Shows how far a run over a log is, in a line that a terminal keeps showing."""
 
     def __init__(self) -> None:
-        self._is_terminal = sys.stderr.isatty()
-        self._start_s = self._shown_s = time.monotonic()
+        self._start_s = time.monotonic()
 
     def __call__(self, statistics: RunStatistics, expected: int | None, ended: bool) -> None:
         """Show the progress now; ended: remove it."""
-        newest, now_s = statistics.newest, time.monotonic()
-        if ended:
+        newest = statistics.newest
+        if ended or newest is None:
             HANDLER.show("")
-        elif newest is not None and (self._is_terminal or now_s >= self._shown_s + 5):
-            self._shown_s, done = now_s, newest.seq + 1
-            share = f"{done}/{expected}" if expected else f"{done}"
-            rate = done / max(1e-3, now_s - self._start_s)
-            line = f"{share} pairs, {rate:.1f} pairs/s, {statistics.length_m:.2f} m, {newest.state}"
-            HANDLER.show(line) if self._is_terminal else log(logging.INFO, line)
+            return
+        done, passed_s = newest.seq + 1, time.monotonic() - self._start_s
+        share = f"{done}/{expected}" if expected else f"{done}"
+        rate = done / max(1e-3, passed_s)
+        HANDLER.show(f"{share} pairs, {rate:.1f} pairs/s, {statistics.length_m:.2f} m, {newest.state}")
 
 
 def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
     """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
     stats: dict[str, Any] = pairing.stats()
     poses, states, dark = statistics.poses, statistics.states, statistics.dark
-    lost, notable = states[TrackingState.LOST], NOTABLE_SHARE * poses
-    unsure, unpaired = lost + states[TrackingState.DEGRADED], min(stats["unpaired_lower"], stats["unpaired_upper"])
-    found: list[tuple[object, str]] = [
-        # 1. Images and their stamps.
-        (stats["_fault"], f"{stats['broken']} images could not be used; the first: {stats['_fault']}"),
-        (
-            not stats["pairs"] and not unpaired,
-            "no pair of images: a camera has none that can be used",
-        ),
-        (
-            unpaired > stats["pairs"],
+    lost, degraded, notable = states[TrackingState.LOST], states[TrackingState.DEGRADED], NOTABLE_SHARE * poses
+    unpaired = min(stats["unpaired_lower"], stats["unpaired_upper"])
+    # 1. Images and their stamps.
+    if stats["_fault"]:
+        yield f"{stats['broken']} images could not be used; the first: {stats['_fault']}"
+    if not stats["pairs"] and not unpaired:
+        yield "no pair of images: a camera has none that can be used"
+    if unpaired > stats["pairs"]:
+        yield (
             "most images of both cameras found no partner: their stamps are more than pair.tolerance_ms = "
-            f"{stats['tolerance_ms']:g} apart: correct the clocks of the cameras, synchronise them, or increase it",
-        ),
-        *(
-            (
-                stats[f"repeated_{camera}"] >= FROZEN_IMAGES,
-                f"the {camera} camera was frozen: {stats[f'repeated_{camera}']} of its images repeat earlier ones; "
-                "their pairs are left out, unless pair.repeated_images = 'use', as for a simulator without noise",
+            f"{stats['tolerance_ms']:g} apart: correct the clocks of the cameras, synchronise them, or increase it"
+        )
+    for camera in CAMERAS:
+        if (repeated := stats[f"repeated_{camera}"]) >= FROZEN_IMAGES:
+            yield (
+                f"the {camera} camera was frozen: {repeated} of its images repeat earlier ones; their pairs are left "
+                "out, unless pair.repeated_images = 'use', as for a simulator without noise"
             )
-            for camera in CAMERAS
-        ),
-        # 2. The rig, the light, dead parts of images.
-        (rig.warning, rig.warning),
-        (
-            dark > notable,
+    # 2. The rig, the light, dead parts of images.
+    if rig.warning:
+        yield rig.warning
+    if dark > notable:
+        yield (
             f"it was too dark in {dark} of {poses} pairs: the images have more noise than contrast; more light, a "
-            "longer exposure (cameras.exposure_us) or less gain",
-        ),
-        *(
-            (
-                statistics.lost_parts[side] > notable,
-                f"a part of the {side} camera's image was frozen, dark, saturated or blurred in "
-                f"{statistics.lost_parts[side]} of {poses} pairs: clean the mirror, check the camera and its driver",
+            "longer exposure (cameras.exposure_us) or less gain"
+        )
+    for side in SIDES:
+        if (parts := statistics.lost_parts[side]) > notable:
+            yield (
+                f"a part of the {side} camera's image was frozen, dark, saturated or blurred in {parts} of {poses} "
+                "pairs: clean the mirror, check the camera and its driver"
             )
-            for side in SIDES
-        ),
-        # 3. Poses that are not sure.
-        (
-            unsure > poses / 2,
-            f"the pose was lost in {lost} of {poses} pairs, degraded in {unsure - lost}: is the rig that of these "
-            "cameras, is --lower the lower one, are the images bright and sharp, is the robot slower than "
-            f"odometry.limits.max_speed_mps = {config.odometry.limits.max_speed_mps:g}?",
-        ),
-    ]
-    return (line for is_so, line in found if is_so)
+    # 3. Poses that are not sure.
+    if lost + degraded > poses / 2:
+        yield (
+            f"the pose was lost in {lost} of {poses} pairs, degraded in {degraded}: is the rig that of these cameras, "
+            "is --lower the lower one, are the images bright and sharp, is the robot slower than "
+            f"odometry.limits.max_speed_mps = {config.odometry.limits.max_speed_mps:g}?"
+        )

@@ -136,7 +136,7 @@ class StatusCollector:
 def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> Stats:
     """Return the counters and times of the controller, whether the wheels turn, and why they do not."""
     state, late = controller.state, controller.lateness  # read once, for another thread replaces it
-    # 1. Why they stand or are slow; a controller that has failed is an error, but not while it boots.
+    # 1. Why they stand or are slow; a controller that has failed is an error, one that is awaited is none.
     stop = state.disarmed_by if state.reason == NOT_ARMED else state.reason
     slow = "" if state.reason else state.slowed_by or state.obstacle
     words = stop or (f"driving slowly: {slow}" if slow else "driving")
@@ -146,8 +146,7 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         words = f"{stop}: {state.problem}"
     elif not stop and state.blocked:
         words = f"stopped: {state.obstacle}"
-    boots = state.reason == AWAITED and not state.overdue
-    has_failed = (state.reason == FAILED or state.failed or state.fault) and not boots
+    has_failed = state.reason != AWAITED and (state.reason == FAILED or state.failed or state.fault)
     is_unwanted = slow or stop not in ("", IDLE, ASKED, COMMAND_STALE, STARTED)
     severity = "_error" if has_failed else "_warning" if is_unwanted else "_words"
     # 2. The numbers.

@@ -1,9 +1,8 @@
 """What brings poses to the controller, on the robot and in a replay.
 
-One law, two clocks. `omnid run` and `omnid replay --motor` step the law in the controller process, in real time, and
-send what it gives to the motor controller. LockstepDrive steps the same law on the stamps of the log, so that what a
-replay publishes and records as `<robot>/drive` is a function of log and configuration alone: threaded and inline runs,
-on a fast and on a slow host, with and without --motor, give the same bytes.
+`omnid run` and `omnid replay --motor` step the control law in the controller process, in real time. LockstepDrive steps
+it on the stamps of the log, so that what a replay publishes and records as `<robot>/drive` is a function of log and
+configuration alone: inline or not, with and without --motor, the bytes are the same.
 """
 
 from __future__ import annotations
@@ -39,7 +38,6 @@ GRANTED: Final = {  # what the robot does after a request that it has accepted; 
     "repeat": "it repeats the route {0}",
     "stop": "the route has ended",
 }
-FAILED_S: Final = 3.0  # a motor controller that has failed for this time ends a replay
 NO_MOTOR: Final = (
     "the motor controller does not answer any more; its own watchdog stops the wheels: check its power and its cable"
 )
@@ -91,29 +89,25 @@ class ReplayDrive:
         """health: of the rig; the wheels stand until the first pairs have shown whether it is right."""
         self._link, self._setpoint, self._T_base_rig = link, setpoint, T_base_rig
         self._health, self._has_begun = health, False
-        self._answered_ns = 0  # when the motor controller had not failed for the last time
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Send a pose and the setpoint; DriverError where the motor controller has failed for FAILED_S."""
+        """Send a pose and the setpoint as of now; DriverError where the motor controller has failed."""
         self._has_begun |= not self._health.is_checking
-        if not self._has_begun:
-            return
-        # 1. Send both as of now, and take the controller's reports.
-        now_ns = time.monotonic_ns()
-        self._link.send(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
-        self._link.send(TimedSetpoint(now_ns, self._setpoint))
-        self._link.receive_waiting()
-        # 2. End the run where the motor controller does not come back.
-        if not self._link.statistics.state.failed or not self._answered_ns:
-            self._answered_ns = now_ns
-        elif (now_ns - self._answered_ns) * S_PER_NS > FAILED_S:
-            raise DriverError(NO_MOTOR)
+        if self._has_begun:
+            now_ns = time.monotonic_ns()
+            self._link.send(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
+            self._link.send(TimedSetpoint(now_ns, self._setpoint))
+            self._link.receive_waiting()
+            self._require_motor()
 
     def finish(self) -> None:
         """Have the wheels slow down to a stop, take the last reports; DriverError where the motor controller failed."""
         self._link.end()
         for _ in self._link.commands():
             pass
+        self._require_motor()
+
+    def _require_motor(self) -> None:
         if self._link.statistics.state.failed:
             raise DriverError(NO_MOTOR)
 
@@ -139,24 +133,18 @@ class LockstepDrive:
 
     def process(self, odometry: OdometryUpdate) -> VelocityCommand:
         """Return the command that follows from a pose, at its stamp."""
-        # 1. The ticks since the last pose, by which a gap in the log stops the wheels.
+        # 1. The ticks since the last pose; none once the wheels are at rest.
         stamp_ns = odometry.stamp_ns
-        self._tick_until(stamp_ns)
-        # 2. The tick at this pose, whose command is recorded.
-        self._law.take(controller_pose(odometry, self._T_base_rig))
-        output = self._step(stamp_ns)
-        return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
-
-    def _tick_until(self, stamp_ns: int) -> None:
-        """Tick between the last pose and the next; ticks are omitted once the wheels are at rest."""
-        if self._last_ns is None:
-            return
-        ticks = range(self._last_ns + self._period_ns, stamp_ns, self._period_ns)
+        ticks = range(stamp_ns if self._last_ns is None else self._last_ns, stamp_ns, self._period_ns)[1:]
         for tick_ns in ticks:
             output = self._step(tick_ns)
             if output.reason and output.motion == STOP:
                 self._last_ns = ticks[-1]
-                return
+                break
+        # 2. The tick at this pose, whose command is recorded.
+        self._law.take(controller_pose(odometry, self._T_base_rig))
+        output = self._step(stamp_ns)
+        return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
 
     def _step(self, now_ns: int) -> ControlOutput:
         dt_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * S_PER_NS

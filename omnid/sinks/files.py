@@ -33,10 +33,22 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
     """
     used = {_identity(path): what for what, path in inputs}
     for option, path in outputs:
-        wrong = _why_not_written(option, path)
-        other = used.setdefault(_identity(path), option)
-        if not wrong and other != option and path.exists() == path.is_file():
-            wrong = f"this is {other} as well"
+        wrong = ""
+        try:
+            if path.is_dir():
+                wrong = "expected a file to write, found a folder"
+            elif not path.parent.is_dir():
+                wrong = f"there is no folder {path.parent}"
+            elif path.exists() and not path.is_file():  # not opened: a pipe that is opened would end its reader
+                wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
+            elif (other := used.setdefault(_identity(path), option)) != option:
+                wrong = f"this is {other} as well"
+            elif is_locked(path):
+                wrong = "another program is writing it"
+            elif not os.access(path if path.exists() else path.parent, os.W_OK):
+                wrong = "it may not be written"
+        except OSError as error:
+            wrong = error.strerror or str(error)
         if wrong:
             raise OmnidError(f"{option} {path}: {wrong}; name another file")
 
@@ -47,26 +59,6 @@ def _identity(path: Path) -> tuple[int, int] | str:
         found = path.stat()
         return found.st_dev, found.st_ino
     return os.path.realpath(path)
-
-
-def _why_not_written(option: str, path: Path) -> str:
-    """Return why a file cannot be written; empty if it can."""
-    try:
-        if path.is_dir():
-            return "expected a file to write, found a folder"
-        if not path.parent.is_dir():
-            return f"there is no folder {path.parent}"
-        if path.exists() and not path.is_file():  # not opened: a pipe that is opened and closed would end its reader
-            return "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
-        is_new = not path.exists()
-        path.open("ab").close()
-        if is_new:
-            os.unlink(os.path.realpath(path))  # where path is a link, it stays one
-        elif is_locked(path):
-            return "another program is writing it"
-    except OSError as error:
-        return f"cannot be written: {error.strerror or error}"
-    return ""
 
 
 class TrajectoryFile:
@@ -85,21 +77,17 @@ class TrajectoryFile:
 
     def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
         """Write the row of a pose (4, 4). Raises OmnidError."""
+        row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
         try:
-            row, file = tum_row(stamp_ns, T).encode("ascii") + b"\n", self.opened()
-            written = file.write(row)
+            if self._file is None:
+                self._file = self._path.open("wb", buffering=0)
+                lock(self._file)
+            written = self._file.write(row)
             if written != len(row):
-                file.truncate(file.tell() - written)  # A part of a row is none.
+                self._file.truncate(self._file.tell() - written)  # A part of a row is none.
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error
-
-    def opened(self) -> FileIO:
-        """Return the file, which is begun anew when it is first asked for."""
-        if self._file is None:
-            self._file = self._path.open("wb", buffering=0)
-            lock(self._file)
-        return self._file
 
     def finish(self) -> None:
         """Close the file."""
@@ -119,9 +107,9 @@ def write_trajectory(
     """
     known = np.ones(len(stamps_ns), bool) if known is None else known
     file = TrajectoryFile(path)
+    if len(known) and not known.any():  # no result is an empty file, not that of an earlier run
+        path.write_bytes(b"")
     try:
-        if len(stamps_ns):
-            file.opened()
         for stamp_ns, T, is_known in zip(stamps_ns.tolist(), poses, known, strict=True):
             if is_known:
                 file.write(stamp_ns, T)

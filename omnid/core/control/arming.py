@@ -75,11 +75,11 @@ class ArmAnswer(NamedTuple):
     id: that of the request, 0 before the first one. refusal: why it was refused, empty if it was accepted.
     """
 
-    id: int
-    refusal: str
+    id: int = 0
+    refusal: str = ""
 
 
-NO_ANSWER: Final = ArmAnswer(0, "")
+NO_ANSWER: Final = ArmAnswer()
 
 
 class Arming:

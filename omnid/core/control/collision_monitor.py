@@ -80,7 +80,6 @@ class ControllerScan(NamedTuple):
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
 STRAIGHT_RADPS: Final = 1e-3
 TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
-INSTANT_S: Final = 1e-6  # over which a speed of approach is measured
 
 
 class Outline(NamedTuple):
@@ -111,8 +110,15 @@ class Outline(NamedTuple):
 
     def approach_mps(self, x_m: float, y_m: float, motion: Twist) -> float:
         """Return the speed at which a motion takes the outline nearer to a point, or a point inside it deeper."""
-        vx, vy = motion.yaw_rate_radps * y_m - motion.velocity_mps, -motion.yaw_rate_radps * x_m
-        return (self.depth_m(x_m, y_m) - self.depth_m(x_m + vx * INSTANT_S, y_m + vy * INSTANT_S)) / INSTANT_S
+        # The velocity of the point in the frame of the base, towards the nearest edges.
+        vx, vy = motion.velocity_mps - motion.yaw_rate_radps * y_m, motion.yaw_rate_radps * x_m
+        ahead_m, behind_m, dy = x_m - self.front_m, -self.rear_m - x_m, abs(y_m) - self.half_width_m
+        dx, vx = (ahead_m, vx) if ahead_m > behind_m else (behind_m, -vx)
+        vy = vy if y_m > 0.0 else -vy
+        if max(dx, dy) <= 0.0:
+            return vx if dx > dy else vy
+        dx, dy = max(dx, 0.0), max(dy, 0.0)
+        return (dx * vx + dy * vy) / math.hypot(dx, dy)
 
     def contact_s(self, motion: Twist, points: Iterable[Point]) -> float:
         """Return the time until the outline first touches one of the points outside it, inf if it never does."""
@@ -224,15 +230,12 @@ LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on developm
 # A way that approaches an unknown region at its side by no more than this slope runs along it, because a correction of
 # the heading by three degrees does. The nearest corner is then 5 cm nearer after 1 m, before which newer scans judge.
 ALONG_SLOPE: Final = 0.05
-# A base that was stopped resumes in that direction only faster than this (half as fast as a slower command), because
-# free ranges change by a cell of 5 cm from scan to scan: at time_s of 1.5 s it is the speed for 9 cm.
-RESUME_MPS: Final = 0.06
-BESIDE_M: Final = 0.05  # Room beyond the sides' clearance, because corrections of the heading swing no corner farther.
+# Free ranges change by a cell of so much from scan to scan; corrections of the heading swing no corner farther.
+BESIDE_M: Final = 0.05
 # Step of the prediction of moving obstacles, short because a person at 1.5 m/s moves 0.15 m in it.
 MOVING_STEP_S: Final = 0.1
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
 NEW_MPS: Final = 0.4  # Sigma of a velocity by two pairs, large because a third one makes it smaller.
-MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
 # Speed of a person who walks towards the base, and the time until it brakes, because two pairs at 10 Hz show the
 # person, and images and commands are 0.2 s on their way.
 WALK_MPS, TURN_S = 1.6, 0.4
@@ -260,11 +263,11 @@ def remedy(reason: str) -> str:
 class Allowance(NamedTuple):
     """Allowed share of a motion, and why it is less than all of it."""
 
-    share: float
-    reason: str  # empty where the share is 1
+    share: float = 1.0
+    reason: str = ""  # empty where the share is 1
 
 
-FREE: Final = Allowance(1.0, "")
+FREE: Final = Allowance()
 
 
 class Kind(NamedTuple):
@@ -326,10 +329,10 @@ class CollisionMonitor:
         to_heading: the yaw rate leads to a heading, to which the base turns on the spot where it may not drive.
         Otherwise it would never move again where the arc to a free direction is closed.
         """
-        # 1. Judge the motion; a base that was stopped stays so while it could only creep on.
+        # 1. Judge the motion; a base that was stopped stays so while it could only creep on by two cells.
         share, reason = self._judged(now_ns, motion)
         speed_mps = abs(motion.velocity_mps)
-        creeps = share < 1.0 and share * speed_mps < min(RESUME_MPS, speed_mps / 2)
+        creeps = share < 1.0 and share * speed_mps < min(2 * BESIDE_M / self._settings.time_s, speed_mps / 2)
         if creeps and self._stopped_mps * motion.velocity_mps > 0.0 and share > 0.0:
             share, reason = 0.0, self.reason
         self.share, self.reason = share, reason
@@ -466,7 +469,7 @@ class CollisionMonitor:
                     continue
             gap_m = max(stop.depth_m(x, y), 0.0) - one.radius_m
             if gap_m <= 0.0:
-                share = 0.0 if ahead_s <= MOVING_STOP_S else ahead_s / MOVING_S
+                share = 0.0 if ahead_s <= settings.stale_s else ahead_s / MOVING_S
                 return min(allowance, Allowance(share, MOVING))
             if one.sigma_mps > NEW_MPS and gap_m <= math.hypot(one.sigma_m, at_s * one.sigma_mps):
                 most_mps = max(settings.slow_mps, speed_mps * ahead_s / MOVING_S)

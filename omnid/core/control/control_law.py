@@ -17,6 +17,7 @@ from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest, Con
 from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import CommandSelector, TimedSetpoint
 from omnid.core.control.heading_controller import (
+    JUMP_RAD,
     LONGEST_TICK_S,
     STOP,
     HeadingGoal,
@@ -31,10 +32,7 @@ from omnid.core.control.safety_rules import FAULTS, Deadlines, stop_reason
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.tracking_state import TrackingState
 
-TO_STAND: Final = Setpoint(0.0)
-# Change of the heading beyond what the base can turn, from which odometry was corrected or is wrong. By judgement, far
-# above the noise of a heading.
-JUMP_RAD: Final = 0.3
+TO_STAND: Final = Setpoint()
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,9 @@ from msgspec import Meta
 
 LONGEST_TICK_S: Final = 0.2  # a late tick does not allow a larger step; by trial on development seeds
 GAIN_HZ: Final = 1.5  # yaw rate per heading error
-HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would change the side to turn to
+# Far above the noise of a heading: a larger change is a jump of odometry, and closer to half a turn than this the base
+# keeps the side to which it turns.
+JUMP_RAD: Final = 0.3
 # Share of a deceleration that is planned for braking; the rest is left for the lag of the base.
 BRAKING_SHARE: Final = 0.8
 # Between the heading that a motor controller reported and its turn to the next goal; by trial with simulated ones.
@@ -24,7 +26,7 @@ REACTION_S: Final = 0.15
 class Setpoint:
     """A wanted speed, and a wanted heading in odom or, where that is None, a wanted yaw rate."""
 
-    velocity_mps: float
+    velocity_mps: float = 0.0
     heading_rad: float | None = None
     yaw_rate_radps: float = 0.0
 
@@ -105,8 +107,7 @@ def towards(setpoint: Setpoint, heading_rad: float, last: Twist, limits: Velocit
         return limits.within(wanted)
     error_rad = wrap_angle(wrap_angle(setpoint.heading_rad) - heading_rad)
     size_rad, side = abs(error_rad), error_rad
-    # Near half a turn the base keeps the side to which it turns.
-    if size_rad > math.pi - HALF_TURN_RAD and last.yaw_rate_radps != 0.0:
+    if size_rad > math.pi - JUMP_RAD and last.yaw_rate_radps != 0.0:
         side = last.yaw_rate_radps
     braking_radps = math.sqrt(2 * BRAKING_SHARE * limits.yaw_acceleration_radps2 * size_rad)
     return limits.within(Twist(setpoint.velocity_mps, math.copysign(min(GAIN_HZ * size_rad, braking_radps), side)))

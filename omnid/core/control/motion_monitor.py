@@ -27,14 +27,9 @@ from omnid.tracking_state import TrackingState
 
 MAX_MOTIONS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
 SIGMAS: Final = 3.0  # Noise exceeds this in 0.3 % of the samples, so that false alarms are rare.
-# Fraction of the stopping limit by which the sum falls per second while nothing is unexplained; by trial on development
-# seeds.
-RECOVERY: Final = 0.5
-# After this time at rest by command, all unexplained motion is forgotten; by trial on development seeds.
+# Time in which disturbances pass: all unexplained motion is forgotten after so long at rest by command, and while
+# nothing more is unexplained; a voltage that is low for so long is not that of a motor that starts.
 REST_S: Final = 2.0
-
-# A voltage may be low for this time while a motor starts; by trial on development seeds.
-BATTERY_S: Final = 2.0
 POSE_DEGRADED: Final = "the pose is degraded"
 MOTION_DOUBTFUL: Final = "the motion that is seen or reported is not the commanded one"
 
@@ -184,7 +179,7 @@ class Plausibility:
             POSE_RESET: self._is_reset,
             POSE_UNSURE: _seconds(self._unsure_ns) >= self._trust.sigma_s,
             MOTOR_FAULT: self._is_faulty,
-            BATTERY_EMPTY: _seconds(self._low_ns) >= BATTERY_S,
+            BATTERY_EMPTY: _seconds(self._low_ns) >= REST_S,
             self.reason: True,
             self.conflict.reason: self.conflict.is_fault,
         }
@@ -272,7 +267,7 @@ class Plausibility:
             of = too_little if beyond * (low + high) < 0.0 else too_much
             for reason in dict.fromkeys((too_little, too_much)):
                 sums, adds = self._unexplained[reason], beyond != 0.0 and reason == of
-                sums[axis] = max(0.0, sums[axis] + dt_s * (abs(beyond) if adds else -RECOVERY * limit))
+                sums[axis] = max(0.0, sums[axis] + dt_s * (abs(beyond) if adds else -limit / REST_S))
                 if sums[axis] > limit:
                     self.reason = self.reason or reason
 

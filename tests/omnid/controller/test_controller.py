@@ -5,22 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.serial_motor import LateReplyError
-from drivers.motors.simulated_motor import MotionLimits, SimulatedBase, SimulatedMotor
+from drivers.motors.simulated_motor import MotionLimits, SimulatedBase
 from omnid.controller.controller import Controller
-from omnid.controller.motor import MotorSettings, open_motor
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
+from omnid.core.control.arming import AUTOMATIC, MANUAL
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import (
@@ -105,26 +101,6 @@ def test_a_pose_that_jumps_does_not_turn_a_base_that_drives_straight_on(jump_rad
     robot.run(STRAIGHT, 60)
     assert robot.heading_rad == pytest.approx(0.0, abs=1e-9)
     assert robot.controller.state.stops == {POSE_JUMPED: 1}, "its setpoints until then are void"
-
-
-@pytest.mark.hazard("H12")
-def test_a_setpoint_from_before_a_jump_is_void_and_the_robot_stays_armed() -> None:
-    robot = Lockstep()
-    robot.controller = Controller(
-        robot.driver, replace(HOLDER_SETTINGS, arming="manual"), PERIOD_S, clock_ns=lambda: robot.now_ns
-    )
-    robot.run(STRAIGHT, 2)
-    robot.controller.take(ArmRequest(robot.now_ns))
-    robot.run(STRAIGHT, 40)
-    assert robot.driver.base.velocity_mps > 0.15
-    for _ in range(20):  # the operator sends no more, and the pose jumps
-        robot.now_ns += round(PERIOD_S * 1e9)
-        robot.controller.take(ControllerPose(robot.now_ns, 1.5, 0.0, "tracking"))
-        robot.controller.tick()
-    assert robot.heading_rad == 0.0 and robot.driver.base.velocity_mps == 0.0
-    robot.jump_rad = 1.5
-    robot.run(STRAIGHT, 40)
-    assert robot.driver.base.velocity_mps > 0.15, "it obeys the next one"
 
 
 @pytest.fixture
@@ -218,28 +194,6 @@ def test_stops_on_an_overloaded_host_and_voids_earlier_setpoints(driving: Bench)
     assert driving.statistics.lateness.max_s == pytest.approx(0.26)
 
 
-def test_a_motor_that_fails_voids_earlier_setpoints(driving: Bench) -> None:
-    driving.wheels.silent = True
-    for _ in range(3):
-        send_both(driving)
-        driving.tick()
-    assert driving.controller.state.errors == 3 and driving.controller.state.failed
-    driving.wheels.silent = False
-    driving.tick()
-    assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.FAILED
-    driving.send_pose()
-    driving.tick()
-    assert is_stop(driving.last), "the setpoint before the stop is void"
-    send_both(driving)
-    driving.tick()
-    assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9, "from a stop"
-    assert driving.lines == [
-        "motor on /dev/x gave no answer",
-        f"the wheels stop: {safety_rules.FAILED}",
-        "the motor controller is back",
-    ]
-
-
 def test_drives_on_where_an_answer_is_late(driving: Bench) -> None:
     send = driving.wheels.send
 
@@ -277,23 +231,6 @@ def test_wheels_that_are_limited_by_their_driver_follow_the_commands(known: bool
 
 
 # The motor of the settings: the simulation of its protocol, and settings that cannot work.
-SLOW_HZ = 1.0  # so that a machine under load has a second to answer
-
-
-def test_simulates_a_motor_controller() -> None:
-    drive = DifferentialDrive(track_m=0.5, reverse_right=True)
-    config = MotorSettings(port="simulated", protocol="roboteq", rate_hz=SLOW_HZ, watchdog_ms=5000, drive=drive)
-    with ExitStack() as closing:
-        driver = open_motor(config, closing)
-        assert isinstance(driver, SimulatedMotor)
-        driver.send(VelocityCommand(0, 0.4, 0.0, 0.2))
-        assert driver.base.commanded_mps == pytest.approx([0.35, 0.45], rel=0.02)
-    assert driver.base.commanded_mps == [0.0, 0.0], "closing stops the wheels"
-
-
-def test_refuses_a_watchdog_of_fewer_than_four_ticks() -> None:
-    with ExitStack() as closing, pytest.raises(DriverError, match="give at least 200, 4 ticks"):
-        open_motor(MotorSettings(port="simulated", rate_hz=20.0, watchdog_ms=199), closing)
 
 
 # docs/safety.md: each hazard has a test that is marked with it, and each reason to stop says whether it disarms.

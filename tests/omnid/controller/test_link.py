@@ -319,7 +319,7 @@ def test_a_motor_controller_that_comes_late_or_again_drives_only_after_it_was_ar
             return link.statistics.state
 
         # 1. There is no port: it is waited for, and nothing can be armed.
-        wait_until(lambda: state().overdue and "no such port" in state().problem, "the wait for the port")
+        wait_until(lambda: "no such port" in state().problem and bool(state().arm_answer.id), "the wait for the port")
         assert state().reason == state().arm_answer.refusal == safety_rules.AWAITED and not state().armed
         for _ in range(2):
             with contextlib.closing(PtyMotor()) as board:

@@ -37,18 +37,6 @@ def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene
         assert "omnid calibrate drive --only check" in err
 
 
-def test_a_rig_that_cannot_be_checked_is_a_warning(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """Darkness decides nothing; light later does."""
-    taken = images(scene / "log.mcap")
-    assert (
-        "could not be checked" in omnid.replay(save(tmp_path / "a.mcap", map(dark, taken)), rig=scene / "rig.toml").err
-    )
-    later = save(tmp_path / "b.mcap", (dark(p) if p.pair < PAIRS // 2 else p for p in taken))
-    assert "could not be checked" not in omnid.replay(later, rig=scene / "rig.toml").err
-    wrong = omnid.replay(later, *EXCHANGED, rig=scene / "rig.toml")
-    assert wrong.code == 2 and wrong.err.count("\n") == 1 and "the other way round" in wrong.err
-
-
 @pytest.mark.hazard("H34")
 @pytest.mark.parametrize(("dead", "words"), [(("lower",), ()), (("lower", "upper"), ("--inline",))])
 def test_pairs_of_a_frozen_camera_give_no_pose(
@@ -84,4 +72,4 @@ def test_warns_if_the_pose_is_always_lost(omnid: Command, tmp_path: Path, scene:
     log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err
-    assert f"too dark in {PAIRS} of {PAIRS} pairs" in result.err
+    assert f"too dark in {PAIRS} of {PAIRS} pairs" in result.err and "could not be checked" in result.err

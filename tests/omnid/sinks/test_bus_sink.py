@@ -16,7 +16,6 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.client import Robot
 from omnid.controller.link import ControllerStatistics
@@ -231,17 +230,6 @@ def test_a_pose_of_a_replay_counts_as_captured_on_arrival_and_renews_the_setpoin
     assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD, AHEAD]
     assert all(before_ns <= pose.stamp_ns <= time.monotonic_ns() for pose in link.poses)
     assert [arrival_ns for _, arrival_ns in link.setpoints] == [pose.stamp_ns for pose in link.poses]
-
-
-def test_a_motor_controller_that_failed_ends_a_replay(link: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = ReplayDrive(link, AHEAD, np.eye(4), rig_health())
-    link.statistics.state.failed = True
-    drive.process(pose_at(1))
-    monkeypatch.setattr("omnid.sinks.drive.FAILED_S", -1.0)
-    with pytest.raises(DriverError, match="does not answer"):
-        drive.process(pose_at(2))
-    with pytest.raises(DriverError, match="does not answer"):
-        drive.finish()
 
 
 def test_the_answers_of_the_navigation_are_given(link: Any) -> None:

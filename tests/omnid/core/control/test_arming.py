@@ -117,12 +117,6 @@ def test_every_fault_of_the_table_is_tested() -> None:
     assert set(FAULTS) == set(safety_rules.FAULTS) - LATCHING - begins
 
 
-def test_refuses_to_arm_before_the_first_pose(bench: Bench) -> None:
-    bench.arm()
-    bench.tick()
-    assert bench.controller.state.arm_answer.refusal == safety_rules.NO_POSE and not bench.controller.state.armed
-
-
 @pytest.mark.hazard("H01")
 def test_is_disarmed_at_the_start(bench: Bench) -> None:
     expect_stand(bench)
@@ -143,17 +137,6 @@ def test_a_fault_that_has_passed_keeps_the_wheels_stopped(driving: Bench, reason
     assert (ADVICE in line) == (reason in DISAGREEMENTS) and "stay stopped until cmd/arm (`omnid arm`)" in line
     driving.drive()
     assert driving.last.velocity_mps == 0.3
-
-
-def test_a_fault_while_the_wheels_stand_is_reported(driving: Bench) -> None:
-    for _ in range(60):  # the operator has let go of the stick: a stale command stops the wheels and disarms nothing
-        driving.send_pose()
-        driving.tick()
-    assert is_stop(driving.last) and driving.controller.state.armed
-    report_a_fault(driving)
-    driving.tick()
-    reported = [line for line in driving.lines if line.startswith("disarmed while the wheels are stopped")]
-    assert len(reported) == 1 and safety_rules.MOTOR_FAULT in reported[0] and "cmd/arm" in reported[0]
 
 
 @pytest.mark.parametrize("reason", FAULTS)

@@ -71,22 +71,6 @@ def test_the_way_since_the_images_of_the_scan_counts() -> None:
     assert 0.3 < driven_m <= WALL_M - collision.front_m - collision.stop_m + 0.02
 
 
-def test_a_base_before_a_post_turns_to_a_heading_and_drives_on_from_there() -> None:
-    law = ControlLaw(ControllerSettings(arming=AUTOMATIC, collision=CollisionSettings(stale_s=100.0)), START_NS)
-    heading_rad = driven_m = 0.0
-    for tick in range(1, 400):
-        now_ns, turned = START_NS + tick * TICK_NS, round(math.degrees(heading_rad))
-        # A post 0.38 m ahead of the first pose, so that the base may not begin an arc; it stays where it is.
-        ranges = tuple(0.38 if abs(k - 179.5 + turned) < 8 else math.inf for k in range(360))
-        law.take(ControllerScan(now_ns, ranges))
-        law.take(ControllerPose(now_ns, heading_rad, law.motion.yaw_rate_radps, "tracking", 0.0))
-        law.take(TimedSetpoint(now_ns, Setpoint(0.3, heading_rad=math.radians(90))))
-        motion = law.step(now_ns, TICK_S).motion
-        heading_rad, driven_m = heading_rad + motion.yaw_rate_radps * TICK_S, driven_m + motion.velocity_mps * TICK_S
-        assert motion.velocity_mps == 0.0 or heading_rad > math.radians(10)
-    assert heading_rad > math.radians(85) and driven_m > 0.5
-
-
 @pytest.mark.hazard("H19")
 @pytest.mark.parametrize("rate_hz", [20, 50, 200])
 @pytest.mark.parametrize("wanted", [Setpoint(0.5, heading_rad=0.0), Setpoint(0.5, None, 0.02), Setpoint(0.008)])
