@@ -50,7 +50,6 @@ class Controller:
         self._law = ControlLaw(settings, self._clock_ns())
         self._last_ns = 0  # the last tick
         self.due_ns = 0  # when the next one is due (CLOCK_MONOTONIC); 0: at once
-        self._driven_ns = 0  # capture of the newest pose that a command has followed from
         self._motor_stopped = False  # True if the motor controller stopped by itself before the last tick
         self.state = ControllerState(failed=is_awaited)
 
@@ -98,18 +97,13 @@ class Controller:
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
         law.plausibility.add_command(now_ns, STOP if state.failed else Twist(*self._limited(command)))
-        to_wheel_s, wheels = math.nan, None
+        wheels = None
         if status is not None:
             self._take_status(status, now_ns)
             if math.isfinite(status.velocity_mps):
                 wheels = WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps)
-        # 4. Report times: the age of images where this command is the first that follows from them.
-        done_ns = self._clock_ns()
-        if status is not None and law.pose is not None and law.pose.stamp_ns > self._driven_ns:
-            self._driven_ns = law.pose.stamp_ns
-            to_wheel_s = (done_ns - self._driven_ns) * S_PER_NS
-        accepted = None if status is None else command
-        return TickReport(accepted, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s, state, wheels)
+        work_s = (self._clock_ns() - now_ns) * S_PER_NS
+        return TickReport(None if status is None else command, late_s, work_s, state, wheels)
 
     def close(self) -> None:
         """Stop the wheels at once and release the driver."""

@@ -107,13 +107,14 @@ def transitions(before: ControllerState, after: ControllerState, conflict: Confl
 
     conflict: how images, wheels and gyro differ, where they do.
     """
+    detail = {conflict.reason: f" {conflict.detail}"} if conflict.detail else {}
     # 1. Arming: each time, and a refusal where its reason is another one.
     answer, last = after.arm_answer, before.arm_answer
     if answer != last and (not answer.refusal or answer.refusal != last.refusal):
         yield f"arming is refused: {answer.refusal}" if answer.refusal else ARMED
     # 2. A reason to drive slowly that a person should examine.
     if after.slowed_by != before.slowed_by and after.slowed_by in (MOTION_DOUBTFUL, *CONFLICTS):
-        yield f"the wheels turn slowly: {after.slowed_by}{_detail(after.slowed_by, conflict)}"
+        yield f"the wheels turn slowly: {after.slowed_by}{detail.get(after.slowed_by, '')}"
     # 3. A stop by the collision monitor.
     if after.blocked and not before.blocked:
         yield f"the wheels stop: {after.obstacle}; {remedy(after.obstacle)}"
@@ -121,12 +122,7 @@ def transitions(before: ControllerState, after: ControllerState, conflict: Confl
     if cuts_drive_short(before, after) and after.reason != ENDS:
         latched = f"; {UNTIL_ARMED}" if after.needs_request else ""
         advice = f"; {ADVICE}" if after.reason in DISAGREEMENTS else ""
-        yield f"the wheels stop: {after.reason}{_detail(after.reason, conflict)}{advice}{latched}"
-
-
-def _detail(reason: str, conflict: Conflict) -> str:
-    """Return by how much images, wheels and gyro differ, where that is the reason."""
-    return f" {conflict.detail}" if conflict.reason == reason and conflict.detail else ""
+        yield f"the wheels stop: {after.reason}{detail.get(after.reason, '')}{advice}{latched}"
 
 
 class TickReport(NamedTuple):
@@ -135,8 +131,6 @@ class TickReport(NamedTuple):
     command: VelocityCommand | None  # command that the motor controller accepted
     late_s: float  # delay of the tick
     work_s: float
-    # time from the capture of a pose's images to this command, the first that follows from it; else NaN
-    to_wheel_s: float
     state: ControllerState
     wheels: WheelSample | None = None  # wheels as the motor controller reports them
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -39,14 +38,13 @@ PROCESS: Final = "omnid.controller.process"
 
 
 class ControllerStatistics:
-    """The newest state, and histograms of lateness and latency."""
+    """The newest state, and a histogram of lateness."""
 
     def __init__(self, stats: StageStats) -> None:
         """stats: the counters of the tick, among those of the stages; busy from one report to the next."""
         self.state = ControllerState()
         self.states: Stream[ControllerState] = Stream()  # of each tick
         self.wheels: Stream[WheelSample] = Stream()  # as the motor controller reports them
-        self.to_wheel = Histogram()
         self.lateness = Histogram()
         self._stats = stats
 
@@ -57,8 +55,6 @@ class ControllerStatistics:
         if tick.wheels is not None:
             self.wheels.push(tick.wheels)
         self.lateness.add(tick.late_s)
-        if math.isfinite(tick.to_wheel_s):
-            self.to_wheel.add(tick.to_wheel_s)
         self._stats.wall.add(tick.work_s)
         self._stats.processed += 1
         self._stats.dropped = tick.state.missed

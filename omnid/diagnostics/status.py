@@ -27,7 +27,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.commands import CommandReceiver
-from omnid.transport.status_names import NOTABLE_SHARE, TIMEOUT_S, Key, Stats, by_reason, entry, time_key, times
+from omnid.transport.status_names import NOTABLE_SHARE, TIMEOUT_S, Key, Stats, by_reason, entry, times
 
 
 class StatusCollector:
@@ -135,7 +135,7 @@ class StatusCollector:
 
 def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> Stats:
     """Return the counters and times of the controller, whether the wheels turn, and why they do not."""
-    state, late = controller.state, controller.lateness  # read once, for another thread replaces it
+    state = controller.state  # read once, for another thread replaces it
     # 1. Why they stand or are slow; a controller that has failed is an error, one that is awaited is none.
     stop = state.disarmed_by if state.reason == NOT_ARMED else state.reason
     slow = "" if state.reason else state.slowed_by or state.obstacle
@@ -160,9 +160,7 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         "stops": commands.stops,
         "command_refusal": commands.wheels.refusal,  # why the newest refused command was refused
         **by_reason(status_names.REFUSED_PREFIX, commands.wheels.refused),
-        **times(status_names.CAPTURE_TO_WHEEL, controller.to_wheel),
-        **times(status_names.TICK_LATE, late),
-        time_key(status_names.TICK_LATE, "p999"): 1e3 * late.p(0.999),
+        **times(status_names.TICK_LATE, controller.lateness),
         Key.ARMED: int(state.armed),
         Key.DISARMED_BY: state.disarmed_by,
         Key.REMEDY: remedy(state.obstacle) if state.blocked else arm,

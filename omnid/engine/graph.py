@@ -234,7 +234,9 @@ class Graph:
         """
         # 1. A thread for each source and each group of stages.
         bodies = self._readers | {name: inbox.serve for name, inbox in self._inboxes.items()}
-        threads = [self._thread(name, body) for name, body in bodies.items()] if self.threaded else []
+        threads = []
+        for name, body in bodies.items() if self.threaded else ():
+            threads.append(threading.Thread(target=self._begin, args=(name, body), name=name))
         # 2. Run, and wait for the end of all.
         try:
             for thread in threads:
@@ -289,12 +291,9 @@ class Graph:
             self.failed.add(name)
             self._errors.append(error)
 
-    def _thread(self, name: str, body: Callable[[], object]) -> threading.Thread:
-        def run() -> None:
-            self._on_thread(name)
-            body()
-
-        return threading.Thread(target=run, name=name)
+    def _begin(self, name: str, body: Callable[[], object]) -> None:
+        self._on_thread(name)
+        body()
 
     def _read(self, stats: StageStats, given: Callable[[], Iterable[object]], stream: Stream[Any]) -> None:
         """Pass on the messages of a source; then its stream ends, and with the last one the inlets."""

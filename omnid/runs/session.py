@@ -32,7 +32,7 @@ from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
 BUS_S: Final = 3.0  # Time until a bus must be closed.
-CLOUD_POINTS: Final = 50_000  # Most points of the map, the most confident ones, in one message.
+CLOUD_POINTS: Final = 50_000  # Most points of the map in one message.
 
 
 def attached_rig(reader: LogReader, log: object) -> Rig:

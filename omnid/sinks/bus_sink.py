@@ -12,7 +12,7 @@ from drivers.motor import VelocityCommand
 from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import OdometryUpdate
-from omnid.sinks.encoder import Encoder, Outgoing, UnixTime, pose_attachment, same_time
+from omnid.sinks.encoder import Encoder, Outgoing, UnixTime, pose_attachment
 from omnid.transport.bus import Bus
 from omnid.transport.codec import CLOCK_SCHEMA, encoded, path_cdr
 from omnid.transport.sensor_codec import image_cdr
@@ -62,7 +62,7 @@ class BusSink:
 class PanoramaSink:
     """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second, while it has a subscriber."""
 
-    def __init__(self, bus: Bus, rate_hz: float, unix_ns: UnixTime = same_time) -> None:
+    def __init__(self, bus: Bus, rate_hz: float, unix_ns: UnixTime = int) -> None:
         """unix_ns: the Encoder's."""
         self._bus, self._period_ns, self._unix_ns = bus, NS_PER_S / rate_hz, unix_ns
         self._next_ns = 0.0

@@ -30,14 +30,6 @@ from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
-GRANTED: Final = {  # what the robot does after a request that it has accepted; else its state
-    "goal": "it drives to the goal",
-    "path": "it drives along the path",
-    "resume": "it goes on",
-    "teach": "it records the route {0}: drive it, then finish it",
-    "repeat": "it repeats the route {0}",
-    "stop": "the route has ended",
-}
 NO_MOTOR: Final = (
     "the motor controller does not answer any more; its own watchdog stops the wheels: check its power and its cable"
 )
@@ -70,10 +62,8 @@ class PlannerDrive:
         if update.setpoint is not None:
             self._link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
         for answer in update.answers:
-            verb, _, name = answer.request.partition(" ")
             state = f"{update.state}: {update.reason}" if update.reason else str(update.state)
-            words = answer.refusal or GRANTED.get(verb, state).format(name)
-            self._answer(answer.id, Answer(not answer.refusal, words))
+            self._answer(answer.id, Answer(not answer.refusal, answer.refusal or f"{answer.request}: {state}"))
 
 
 class ReplayDrive:

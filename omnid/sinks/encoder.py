@@ -13,7 +13,6 @@ from calib.rig import Rig
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.frames import base_pose, in_outer_axes, of_base
-from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
@@ -36,13 +35,6 @@ Outgoing: TypeAlias = (
 
 
 UnixTime: TypeAlias = Callable[[int], int]  # returns the Unix time of a stamp [ns]
-
-
-def same_time(stamp_ns: int) -> int:
-    """Return a stamp that is Unix time already."""
-    return stamp_ns
-
-
 # Topic, ROS type and bytes of an encoded message; a topic without a leading '/' is below the robot's name.
 OutgoingMessage: TypeAlias = tuple[str, str, bytes]
 
@@ -63,14 +55,14 @@ class Encoder:
         self,
         T_base_rig: NDArray[np.float64],
         cloud_points: int,
-        unix_ns: UnixTime = same_time,
+        unix_ns: UnixTime = int,
         rig: Rig | None = None,
         scan_range_m: float = 6.0,
     ) -> None:
-        """cloud_points: the largest number of points of the cloud, the most confident ones.
+        """cloud_points: the largest number of points of the cloud; of more, evenly many are left out.
 
-        unix_ns: returns the Unix time of a stamp of the messages; those of a log are Unix time. rig: with the mounting
-        of the cameras, for the static frames; None: they are left out.
+        unix_ns: returns the Unix time of a stamp of the messages; that of a log is Unix time already. rig: with the
+        mounting of the cameras, for the static frames; None: they are left out.
         """
         self.T_base_rig, self.unix_ns, self._rig = T_base_rig, unix_ns, rig
         self._cloud_points, self._scan_range_m = cloud_points, scan_range_m
@@ -98,8 +90,9 @@ class Encoder:
                 yield _on(SCAN, codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m))
                 yield _on("moving", codec.moving_cdr(stamp_ns, "odom", message.moving))
             case MapUpdate():
-                points = _most_confident(message.points, self._cloud_points)
-                yield _on("cloud", codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig))
+                points, step = message.points, len(message.points.xyz) // self._cloud_points + 1
+                cloud = points.xyz[::step], points.confidence[::step]
+                yield _on("cloud", codec.point_cloud_cdr(stamp_ns, "odom", *cloud, T_frame_points=self.T_base_rig))
             case GridUpdate():
                 grid = message.grid
                 yield _on("map", codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner))
@@ -165,27 +158,18 @@ def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0, run: str = "") -
     return PoseAttachment(odometry.seq, odometry.state, *counts, sent_ns, run).to_bytes()
 
 
-def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return positions and confidence of the most confident points, in the order of the map."""
-    if len(points.xyz) <= count:
-        return points.xyz, points.confidence
-    kept = np.sort(np.argsort(-points.confidence, kind="stable")[:count])
-    return points.xyz[kept], points.confidence[kept]
-
-
 def navigation_stats(update: NavigationUpdate) -> Stats:
     """Return the numbers of an update, for its own topic: see NavigationReport."""
-    hindered = (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED)
-    severity = "_warning" if update.state in hindered else "_words"
-    severity = "_error" if update.state == NavigationState.FAILED else severity
-    stats: dict[str, object] = {
-        Key.STATE: update.state,
-        "task": update.task,
+    severity = "_words"
+    if update.state in (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED):
+        severity = "_warning"
+    elif update.state == NavigationState.FAILED:
+        severity = "_error"
+    names = ("state", "task", "reason", "left_m", "offset_m")
+    stats: dict[str, object] = {name: getattr(update, name) for name in names}
+    stats |= {
         "command_ns": update.command_ns or "",
-        "reason": update.reason,
-        "left_m": update.left_m,
-        "offset_m": update.offset_m,  # of the base to the left of the path
-        "loops_left": update.loops_left if update.loops_left > 1 else "",  # of a route, with the one that is driven
+        "loops_left": update.loops_left if update.loops_left > 1 else "",
         severity: f"{update.state}: {update.reason}" if update.reason else update.state,
     }
     if update.teaching:

@@ -97,7 +97,6 @@ class Key(StrEnum):
 # Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms.
 WORK: Final = "work"
 CAPTURE_TO_POSE: Final = "capture_to_pose"
-CAPTURE_TO_WHEEL: Final = "capture_to_wheel"
 TICK_LATE: Final = "tick_late"
 
 Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys, and words

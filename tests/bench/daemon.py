@@ -31,7 +31,7 @@ RIG = ("--rig", f"{FOLDER}/rig.toml") if Path(FOLDER, "rig.toml").exists() else 
 COLUMNS: Final = columns(
     *("images, busy processes per core", "share of a core||2", "resident|MB|0", "most|MB|0", "poses/s||1"),
     *(f"stamp to client, p{percent}|ms|1" for percent in (50, 90, 99)),
-    *("late ticks of the wheels, p99.9|ms|1", "threads"),
+    *("late ticks of the wheels, p99|ms|1", "threads"),
 )
 
 
@@ -94,7 +94,7 @@ def measure(rate_hz: float, per_core: int, seconds: float, warm_s: float, settin
         latencies_ms = np.array(received_ms(operator, seconds))
         share = (process_time_s(pid) - before_s) / (time.monotonic() - start_s)
         found = status(pid)
-        late_ms = operator.values("wheels").get("tick_late_p999_ms", "nan")
+        late_ms = operator.values("wheels").get("tick_late_p99_ms", "nan")
     return [
         f"{rate_hz:g} Hz, {per_core} busy",
         share,

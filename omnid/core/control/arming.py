@@ -48,8 +48,8 @@ class Contacts:
     def update(self, origin: str, state: ContactState) -> None:
         """Replace the state of an origin."""
         before, self._states[origin] = self._states.get(origin, NO_CONTACT), state
-        begun = {BUMPER: state.bumper_count > before.bumper_count, CLIFF: state.cliff_count > before.cliff_count}
-        self._begun |= {contact for contact, has_begun in begun.items() if has_begun}
+        begun = (BUMPER, state.bumper_count > before.bumper_count), (CLIFF, state.cliff_count > before.cliff_count)
+        self._begun |= {contact for contact, has_begun in begun if has_begun}
 
     def take(self) -> set[str]:
         """Return the contacts that hold, or have begun since the last call."""

@@ -191,26 +191,23 @@ class ControlLaw:
         self._pose_jumped = False
         if self.reason:
             self._void_ns = now_ns
-        # 3. The motion: a ramp to rest, or towards the setpoint as far as trust and obstacles allow.
+        # 3. The motion: a ramp to rest, or towards the setpoint as far as trust and obstacles allow. The collision
+        #    monitor comes last; what it allows is reached with the deceleration of the limits.
+        limits = self._settings.limits
         if self.reason or pose is None or command is None:
-            self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self.goal.stay()
+            self.motion, goal_rad = limits.step(STOP, self.motion, dt_s), self.goal.stay()
         else:
-            heading_rad = self._drive(command.setpoint, pose.heading_at(now_ns), now_ns, dt_s)
+            setpoint, heading_rad = command.setpoint, pose.heading_at(now_ns)
+            wanted = self.plausibility.slowed(towards(setpoint, heading_rad, self.motion, limits), limits)
+            is_heading = setpoint.heading_rad is not None
+            allowed = self.collision.step(now_ns, limits.step(wanted, self.motion, dt_s), to_heading=is_heading)
+            self.motion = limits.step(allowed, self.motion, dt_s)
+            turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
+            error_rad = None if setpoint.heading_rad is None else wrap_angle(setpoint.heading_rad - heading_rad)
+            goal_rad = self.goal.towards(turn_rad, error_rad)
         # 4. The collision monitor follows the motion, so that it knows where an older scan is now.
         self.collision.follow(now_ns, self.motion)
-        return ControlOutput(self.motion, heading_rad, self.reason)
-
-    def _drive(self, setpoint: Setpoint, heading_rad: float, now_ns: int, dt_s: float) -> float:
-        """Step the motion towards a setpoint; return the goal for a motor controller that holds headings."""
-        limits = self._settings.limits
-        wanted = towards(setpoint, heading_rad, self.motion, limits)
-        motion = limits.step(self.plausibility.slowed(wanted, limits), self.motion, dt_s)
-        # The collision monitor comes last; what it allows is reached with the deceleration of the limits.
-        allowed = self.collision.step(now_ns, motion, to_heading=setpoint.heading_rad is not None)
-        self.motion = limits.step(allowed, self.motion, dt_s)
-        turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
-        error_rad = None if setpoint.heading_rad is None else wrap_angle(setpoint.heading_rad - heading_rad)
-        return self.goal.towards(turn_rad, error_rad)
+        return ControlOutput(self.motion, goal_rad, self.reason)
 
     def _jumps(self, before: ControllerPose, pose: ControllerPose) -> bool:
         """True if the heading has changed by more than the base can have turned since the last pose.

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from itertools import chain, takewhile
 from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 from msgspec import Meta
@@ -213,9 +213,8 @@ class Plausibility:
         # What the cameras saw until then is explained by what was commanded, or reported by the wheels.
         if state != TrackingState.LOST and stamp_ns > self._last_seen_ns:
             before_ns, self._last_seen_ns = self._last_seen_ns, stamp_ns
-            if self._drives_at(stamp_ns):
-                explained = [*self._recent(self._commanded, stamp_ns), *self._recent(self._reported, stamp_ns)]
-                self._compare(seen, explained, _passed_s(before_ns, stamp_ns), NOT_SEEN, NOT_COMMANDED)
+            explained = self._explained(stamp_ns, self._reported)
+            self._compare(seen, explained, _passed_s(before_ns, stamp_ns), NOT_SEEN, NOT_COMMANDED)
 
     def add_report(self, now_ns: int, reported: Motion, fault: int, battery_v: float) -> None:
         """Add a report of the motor controller, whose motion is compared with what was commanded.
@@ -229,20 +228,18 @@ class Plausibility:
         self._wheels_report |= reported.velocity_mps != 0.0 or turn_radps != 0.0
         if self._settings.check and self._wheels_report and math.isfinite(reported.velocity_mps):
             self._reported.append((now_ns, reported.velocity_mps, turn_radps))
-            if self._drives_at(now_ns):
-                explained, dt_s = self._recent(self._commanded, now_ns), _passed_s(before_ns, now_ns)
-                self._compare(reported, explained, dt_s, NOT_FOLLOWED, NOT_FOLLOWED)
+            dt_s = _passed_s(before_ns, now_ns)
+            self._compare(reported, self._explained(now_ns), dt_s, NOT_FOLLOWED, NOT_FOLLOWED)
 
-    def _drives_at(self, at_ns: int) -> bool:
-        """True if a motion was commanded within the delay before a time."""
-        return any(velocity_mps or turn_radps for _, velocity_mps, turn_radps in self._recent(self._commanded, at_ns))
-
-    def _recent(self, motions: deque[_TimedMotion], at_ns: int) -> list[_TimedMotion]:
-        """Return the motions within the delay before a time, the newest first."""
+    def _explained(self, at_ns: int, *others: deque[_TimedMotion]) -> list[_TimedMotion]:
+        """Return the motions of commands and others within the delay before a time; none if none was commanded."""
         since_ns = at_ns - self._settings.delay_s / S_PER_NS
-        return [
-            entry for entry in takewhile(lambda entry: entry[0] >= since_ns, reversed(motions)) if entry[0] <= at_ns
+        recent = [
+            [entry for entry in takewhile(lambda entry: entry[0] >= since_ns, reversed(motions)) if entry[0] <= at_ns]
+            for motions in (self._commanded, *others)
         ]
+        is_driven = any(velocity_mps or turn_radps for _, velocity_mps, turn_radps in recent[0])
+        return list(chain(*recent)) if is_driven else []
 
     def _compare(
         self, found: Motion, explained: list[_TimedMotion], dt_s: float, too_little: str, too_much: str
@@ -258,7 +255,7 @@ class Plausibility:
             (found.yaw_rate_radps, limits.yaw_rate_radps + SIGMAS * found.yaw_rate_sigma_radps, limits.stop_rad),
         )
         for axis, (value, tolerance, limit) in enumerate(axes):
-            if not math.isfinite(value):
+            if not explained or not math.isfinite(value):
                 continue
             speeds = [motion[1 + axis] for motion in explained]
             low, high = min(speeds), max(speeds)

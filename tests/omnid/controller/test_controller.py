@@ -132,18 +132,6 @@ def send_both(bench: Bench) -> None:
 
 
 @pytest.mark.hazard("H13")
-def test_stops_where_the_pose_is_stale(driving: Bench) -> None:
-    def late() -> None:
-        driving.send_pose(age_s=1.0)
-        driving.send_setpoint()
-
-    slows_down(driving, late)
-    assert driving.controller.state.reason == safety_rules.POSE_STALE
-    assert driving.controller.state.stops == {safety_rules.POSE_STALE: 1}
-    assert driving.lines == ["the wheels stop: the pose is stale"]
-
-
-@pytest.mark.hazard("H13")
 def test_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
     """At half of the limits, which it comes to within the deceleration, and back again."""
     speeds = [driving.last.velocity_mps]

@@ -72,16 +72,6 @@ def test_raises_the_exposure_to_its_limit_before_the_gain_and_lowers_the_gain_fi
     assert brighter and brighter[0].gain < steps[-1].gain and brighter[0].exposure_us == 20_000
 
 
-def test_never_leaves_its_limits_and_says_so() -> None:
-    law = ExposureLaw(LAW_RANGES, START, 20_000)
-    run(law, Sensor(0.001), 20.0)
-    assert law.setting == ExposureSetting(20_000, 100) and law.state == "too dark"
-    run(law, Sensor(1000.0), 30.0, 40.0)
-    assert law.setting == ExposureSetting(100, 0) and law.state == "too bright"
-    run(law, Sensor(0.5), 30.0, 80.0)
-    assert law.state == "regulated"
-
-
 def test_multiples_of_the_lamps_period() -> None:
     law = ExposureLaw(LAW_RANGES, START, 25_000, flicker_us=10_000.0)
     times = {setting.exposure_us for _, setting in run(law, Sensor(0.2), 20.0)}

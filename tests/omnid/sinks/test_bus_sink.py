@@ -144,7 +144,7 @@ def decoded(message: Outgoing, points: int = 10) -> list[tuple[str, Any]]:
     return [(topic, STORE.deserialize_cdr(payload, schema)) for topic, schema, payload in encode(message)]
 
 
-def test_a_cloud_has_the_most_confident_points_in_their_order() -> None:
+def test_a_cloud_has_a_bounded_number_of_points() -> None:
     xyz = np.arange(12, dtype=np.float32).reshape(4, 3)
     ages = np.zeros(4, np.int32)
     points = MapPoints(xyz, np.array([0.9, 0.1, 0.2, 0.8], np.float32), ages, ages)
@@ -238,5 +238,5 @@ def test_the_answers_of_the_navigation_are_given(link: Any) -> None:
     answers = (RequestAnswer(4, "pause", ""), RequestAnswer(5, "repeat lost", "no route lost"))
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answers=answers)
     drive.process(update)
-    assert answered == [(4, Answer(True, "paused: by a request")), (5, Answer(False, "no route lost"))]
+    assert answered == [(4, Answer(True, "pause: paused: by a request")), (5, Answer(False, "no route lost"))]
     assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD]

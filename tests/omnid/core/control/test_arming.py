@@ -11,10 +11,9 @@ import pytest
 
 from drivers.motor import is_stop
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL, NO_CONTACT, OLDER_THAN_STOP, STARTED, TOO_LATE, ArmRequest
+from omnid.core.control.arming import AUTOMATIC, MANUAL, NO_CONTACT, STARTED
 from omnid.core.control.motion_monitor import (
     ADVICE,
-    COMPARED,
     CONFLICTS,
     DISAGREEMENTS,
     NOT_COMMANDED,
@@ -160,59 +159,6 @@ def test_a_stop_latches_in_both_modes(settings: str) -> None:
     bench.arm()
     bench.drive()
     assert bench.last.velocity_mps == 0.3
-
-
-def test_a_request_that_arrived_before_the_stop_releases_nothing(driving: Bench) -> None:
-    """In either order of their delivery, and at the same instant."""
-    early = ArmRequest(driving.now_ns, 1)
-    driving.now_ns += 1000
-    driving.stop()
-    driving.controller.take(early)
-    expect_stand(driving)
-    assert driving.controller.state.arm_answer.refusal == OLDER_THAN_STOP
-    driving.now_ns += 1
-    driving.controller.take(ArmRequest(driving.now_ns, 2))
-    driving.now_ns += 1
-    driving.stop()
-    expect_stand(driving)
-    driving.controller.stop(driving.now_ns)
-    driving.controller.take(ArmRequest(driving.now_ns, 3))
-    expect_stand(driving)
-    assert driving.controller.state.arm_answer == (3, OLDER_THAN_STOP)
-    assert driving.lines.count(f"arming is refused: {OLDER_THAN_STOP}") == 1, "a repeated refusal is one line"
-
-
-@pytest.mark.parametrize("reason", FAULTS)
-def test_refuses_to_arm_while_a_fault_holds(bench: Bench, reason: str) -> None:
-    bench.send_pose()
-    bench.tick()
-    if reason in (safety_rules.FAILED, safety_rules.STOPPED, safety_rules.MOTOR_FAULT):  # known after its answer
-        FAULTS[reason](bench)
-        bench.send_pose()
-        bench.arm()
-        bench.tick()
-    elif reason in (safety_rules.BATTERY_EMPTY, safety_rules.POSE_UNSURE, *COMPARED):  # of a drive
-        bench.drive()
-        FAULTS[reason](bench)
-        bench.send_pose(sigma_mps=1.0)
-        bench.arm()
-        bench.tick()
-    else:
-        bench.arm()
-        FAULTS[reason](bench)
-    assert bench.controller.state.arm_answer.refusal == reason and not bench.controller.state.armed
-    expect_stand(bench)
-
-
-def test_refuses_a_request_that_was_handled_late(bench: Bench) -> None:
-    """The process got no processor for seconds."""
-    bench.arm()
-    bench.now_ns += 10**9
-    bench.send_pose()
-    bench.controller.due_ns = 0  # the tick itself is in time
-    bench.tick()
-    assert bench.controller.state.arm_answer.refusal == TOO_LATE
-    expect_stand(bench)
 
 
 @pytest.mark.hazard("H08")

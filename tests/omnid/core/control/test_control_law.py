@@ -256,12 +256,3 @@ def assert_within(last: Twist, sent: Twist, dt_s: float) -> None:
     if sent.velocity_mps * last.velocity_mps < 0:  # across zero: the part beyond it is an acceleration
         braking_s = abs(last.velocity_mps) / 2.0
         assert abs(sent.velocity_mps) <= 0.5 * (passed_s - braking_s) * SLACK + tiny
-
-
-@pytest.mark.hazard("H10")
-@pytest.mark.parametrize("seed", range(3))
-def test_is_finite_and_bounded_after_any_previous_motion(seed: int) -> None:
-    rng = random.Random(seed)
-    for _ in range(3000):
-        sent = OF_WHEELS.step(*(Twist(any_speed(rng), any_speed(rng)) for _ in range(2)), any_speed(rng))
-        assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
