@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
-from omnid.core.obstacles.moving_tracker import Arrivals
+from omnid.core.obstacles.moving_tracker import Arrivals, runs
 from omnid.core.obstacles.plane_view import AZIMUTHS, THIN_M
 from omnid.core.obstacles.posterior import RayBelief
 
@@ -294,7 +294,7 @@ class ObstacleGrid:
         others = np.cumsum(np.pad(~lately[rays], ((0, 0), (1, 0))), axis=1)
         every = np.arange(SECTORS)
         ranges_m[(end > REACH_CELLS) | (others[every, np.minimum(end, REACH_CELLS)] > others[every, first])] = np.nan
-        for run in _runs(np.isfinite(ranges_m)):
+        for run in runs(np.isfinite(ranges_m)):
             # Who hides the nearest floor in view stands next to the base.
             range_m = float(ranges_m[run].mean())
             least_rad = p.comes_m / range_m if range_m > self._near_m else p.person_rad
@@ -313,7 +313,7 @@ class ObstacleGrid:
         """
         p, count = self._p, len(belief.first)
         reach_m = np.where(self._hides(belief), 0.0, self._near_m + 2 * CELL_M)
-        for run in _runs(belief.view[:, 0] <= 0):
+        for run in runs(belief.view[:, 0] <= 0):
             if len(run) * math.tau / count >= p.strut_rad:
                 reach_m[run] = 0.0
         reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
@@ -414,12 +414,3 @@ def _without_specks(flags: Bytes) -> Bytes:
     is_kept = of_patch[:, cv2.CC_STAT_AREA] > SPECK_CELLS
     is_kept[0] = False
     return np.asarray(is_kept[labels], np.uint8)
-
-
-def _runs(flags: Flags) -> list[Indices]:
-    """Return the runs of directions (D,) of a turn that are set."""
-    if flags.all() or not flags.any():
-        return [np.flatnonzero(flags)] if flags.any() else []
-    start = int(np.flatnonzero(~flags)[0])
-    at = np.flatnonzero(np.roll(flags, -start))
-    return [(run + start) % len(flags) for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)]

@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths
 
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
 
 class Arrivals(NamedTuple):
     """Ranges from the viewpoint of what has come onto floor that was free, by one pair."""
 
     ranges_m: RangeScan  # (SECTORS,) of its front, NaN where nothing has come
     sigma_m: RangeScan  # (SECTORS,)
-    is_nearer: NDArray[np.bool_]  # (SECTORS,) the nearest floor in view is hidden: the range is the most that it may be
+    is_nearer: Flags  # (SECTORS,) the nearest floor in view is hidden: the range is the most that it may be
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,15 +40,11 @@ class MovingObstacle:
     radius_m: float
 
 
-Array = NDArray[np.float64]
-
-MOST_TRACKS: Final = 16  # so that the memory is bounded
 SAME_SURFACE_M: Final = 0.15  # step in range between sectors of one cluster without noise
 # Sigmas of a range, so that 0.5 % of the steps within a surface are larger: 2.8 of a difference.
 NOISE_SIGMAS: Final = 4.0
 SECTOR_GAP: Final = 2  # sectors without range within a cluster
 WIDEST_M: Final = 1.2  # width of the widest cluster that may be a person or a cart
-LEAST_SECTORS: Final = 3  # because a person is five sectors wide at FARTHEST_M
 FARTHEST_M: Final = 4.0  # Farther clusters are ignored because stereo's noise there appears as motion.
 # Most squared Mahalanobis distance of a cluster from a track, because 99.9 % are below it (chi-squared, 2 dimensions).
 GATE: Final = 13.8
@@ -72,27 +71,12 @@ class Track:
     """A Kalman filter of constant velocity of one object."""
 
     def __init__(self, stamp_ns: int, cluster: Cluster) -> None:
-        self.stamp_ns = self.seen_ns = stamp_ns
-        self.updates, self.radius_m = 1, cluster.radius_m
+        self.seen_ns, self.updates, self.radius_m = stamp_ns, 1, cluster.radius_m
         self.filter = KalmanFilter(dim_x=4, dim_z=2)
         self.filter.H = np.eye(2, 4)
         self.filter.x = np.concatenate([cluster.middle, [0.0, 0.0]])[:, None]
         self.filter.P = START_MPS**2 * np.eye(4)
         self.filter.P[:2, :2] = cluster.covariance
-
-    def predict(self, stamp_ns: int) -> None:
-        """Predict the state at a stamp."""
-        dt_s = (stamp_ns - self.stamp_ns) * 1e-9
-        self.stamp_ns = stamp_ns
-        one_axis = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
-        F, Q = np.kron([[1.0, dt_s], [0.0, 1.0]], np.eye(2)), np.kron(one_axis, np.eye(2))
-        self.filter.predict(F=F, Q=ACCELERATION_PSD * Q)
-
-    def update(self, cluster: Cluster) -> None:
-        """Take a cluster at the stamp of the prediction."""
-        self.filter.update(cluster.middle[:, None], R=cluster.covariance)
-        self.seen_ns, self.radius_m = self.stamp_ns, 0.7 * self.radius_m + 0.3 * cluster.radius_m
-        self.updates += 1
 
     def obstacle(self) -> MovingObstacle | None:
         """Return the track as a moving obstacle; None where it does not move, or one pair, maybe noise, has seen it."""
@@ -106,10 +90,11 @@ class Track:
 
 
 class MovingTracker:
-    """Moving obstacles of the scans of a drive; all memory is bounded."""
+    """Moving obstacles of the scans of a drive."""
 
     def __init__(self) -> None:
         self._tracks: list[Track] = []
+        self._stamp_ns = 0
 
     def clear(self) -> None:
         """Forget everything: odom has lost its relation to the past."""
@@ -121,39 +106,41 @@ class MovingTracker:
         T_odom_eye (4, 4): pose of the viewpoint, with the axes of the base.
         """
         # 1. Predict the tracks.
+        dt_s, self._stamp_ns = (stamp_ns - self._stamp_ns) * 1e-9, stamp_ns
+        one_axis = ACCELERATION_PSD * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+        F, Q = np.kron([[1.0, dt_s], [0.0, 1.0]], np.eye(2)), np.kron(one_axis, np.eye(2))
+        # 2. The cost of a pair of track and cluster is -2 log of its likelihood without constants, `v S^-1 v + log |S|`
+        #    of the innovation v, within the gate of the first part.
+        found, pairs = clusters(T_odom_eye, arrivals), []
         for track in self._tracks:
-            track.predict(stamp_ns)
-        # 2. Give the clusters to tracks, of all pairs the likeliest first, or begin one. The cost of a pair is -2 log
-        #    of its likelihood without constants, `v S^-1 v + log |S|` of the innovation v, within the gate of the first
-        #    part.
-        found = clusters(T_odom_eye, arrivals)
-        cost = np.full((len(self._tracks), len(found)), np.inf)
-        for k, track in enumerate(self._tracks):
-            for n, cluster in enumerate(found):
+            track.filter.predict(F=F, Q=Q)
+            for cluster in found:
                 S, v = track.filter.P[:2, :2] + cluster.covariance, cluster.middle - track.filter.x[:2, 0]
                 distance2 = float(v @ np.linalg.solve(S, v))
                 if distance2 <= GATE:
-                    cost[k, n] = distance2 + math.log(np.linalg.det(S))
-        tracks, is_new = list(self._tracks), np.ones(len(found), bool)
-        while np.isfinite(cost).any():
-            k, n = divmod(int(cost.argmin()), len(found))
-            tracks[k].update(found[n])
-            is_new[n], cost[k], cost[:, n] = False, np.inf, np.inf
-        room = MOST_TRACKS - len(tracks)
-        tracks += [Track(stamp_ns, found[n]) for n in np.flatnonzero(is_new)[:room]]
-        # 3. Forget what was long not seen.
-        self._tracks = [track for track in tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
+                    pairs.append((distance2 + math.log(np.linalg.det(S)), track, cluster))
+        # 3. The likeliest of all pairs first; clusters without a track begin one.
+        begun = {id(cluster): cluster for cluster in found}
+        for _, track, cluster in sorted(pairs, key=lambda pair: pair[0]):
+            if track.seen_ns < stamp_ns and id(cluster) in begun:
+                del begun[id(cluster)]
+                track.filter.update(cluster.middle[:, None], R=cluster.covariance)
+                track.radius_m = 0.7 * track.radius_m + 0.3 * cluster.radius_m
+                track.seen_ns, track.updates = stamp_ns, track.updates + 1
+        self._tracks += [Track(stamp_ns, cluster) for cluster in begun.values()]
+        # 4. Forget what was long not seen.
+        self._tracks = [track for track in self._tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
         return tuple(one for track in self._tracks if (one := track.obstacle()) is not None)
 
 
 def clusters(T_odom_eye: Array, arrivals: Arrivals) -> list[Cluster]:
     """Return the clusters of what has come that are narrow enough."""
     arrived_m, sigma_m = arrivals.ranges_m, arrivals.sigma_m
-    near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
+    is_near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
+    near_m, near_sigma_m = arrived_m[is_near], np.nan_to_num(sigma_m[is_near])
+    is_last = np.abs(np.roll(near_m, -1) - near_m) > SAME_SURFACE_M + NOISE_SIGMAS * near_sigma_m
     found = []
-    for sectors in surfaces(np.where(near, arrived_m, np.nan), sigma_m):
-        if len(sectors) < LEAST_SECTORS:
-            continue
+    for sectors in runs(is_near, SECTOR_GAP, is_last):
         # What hides the nearest floor in view is anywhere before it: as near as a person is who fills that angle.
         most_m = PERSON_M * SECTORS / (math.tau * len(sectors))
         share = np.where(arrivals.is_nearer[sectors], np.minimum(most_m / arrived_m[sectors], 1.0), 1.0)
@@ -172,15 +159,14 @@ def clusters(T_odom_eye: Array, arrivals: Arrivals) -> list[Cluster]:
     return found
 
 
-def surfaces(ranges_m: RangeScan, sigma_m: RangeScan) -> list[NDArray[np.intp]]:
-    """Return the sectors of each surface of a scan, in order around the turn; NaN: none."""
-    known = np.flatnonzero(np.isfinite(ranges_m))
-    if not len(known):
+def runs(flags: Flags, gap: int = 0, is_last: Flags | None = None) -> list[NDArray[np.intp]]:
+    """Return the runs of directions (D,) of a turn that are set, in order around it, with gaps of so many others.
+
+    is_last: those of the directions that are set at which a run ends, however near the next one is; None: none.
+    """
+    found = np.flatnonzero(flags)
+    if not len(found):
         return []
-    following = np.roll(known, -1)
-    largest = SAME_SURFACE_M + NOISE_SIGMAS * np.nan_to_num(sigma_m[known])
-    is_near = (following - known) % SECTORS <= SECTOR_GAP + 1
-    ends = np.flatnonzero(~(is_near & (np.abs(ranges_m[following] - ranges_m[known]) <= largest)))
-    if not len(ends):
-        return [known]
-    return np.split(np.roll(known, -(ends[0] + 1)), (ends - ends[0])[1:])
+    is_end = (np.roll(found, -1) - found) % len(flags) > gap + 1
+    ends = np.flatnonzero(is_end if is_last is None else is_end | is_last)
+    return np.split(np.roll(found, -(ends[0] + 1)), (ends - ends[0])[1:]) if len(ends) else [found]
