@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -10,25 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.panorama import Cylinder
 from calib.rig import Rig
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
+from omnid.core import frames
 from omnid.core.control.collision_monitor import ControllerScan, MovingPoint
 from omnid.core.floor import Floor, FloorEstimator
-from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.posterior import thin_things_m
 from omnid.core.obstacles.ray_scans import RayScans
 from omnid.core.obstacles.settings import ScanSettings
-from omnid.core.obstacles.unwatched import Unwatched
+from omnid.core.stereo.tiles import tile_columns
 from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 ADVICE: Final = "state it by `omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
 
@@ -86,6 +89,26 @@ UNKNOWN: Final = np.full(SECTORS, np.nan, np.float32)
 NOT_FREE: Final = np.zeros(SECTORS, np.float32)
 
 
+# A direction of the cameras is one of the base only far away, because the viewpoint may lie off the base's origin.
+UNWATCHED_M: Final = (0.3, 0.6, 1.2, 2.5, 5.0, math.inf)
+SAMPLES: Final = 13  # across a tile of 6 degrees, so that each sector has two
+
+
+def sectors_of(tiles: Flags, cylinder: Cylinder, T_base_rect: Array, ranges_m: Sequence[float]) -> Flags:
+    """Return the sectors (SECTORS,) about the base that columns of tiles (C,) show at ranges [m].
+
+    T_base_rect (4, 4): from the rectified frame to the base; inf: directions from the viewpoint.
+    """
+    found = np.zeros(SECTORS, bool)
+    width_px = cylinder.width / tile_columns(cylinder)
+    columns = ((np.flatnonzero(tiles)[:, None] + np.linspace(0.0, 1.0, SAMPLES)) * width_px - 0.5).ravel()
+    rays = cylinder.rays(np.column_stack([columns, np.full(columns.size, cylinder.row0)]))
+    direction = (rays @ T_base_rect[:3, :3].T)[:, :2]
+    x, y = np.moveaxis(direction + T_base_rect[:2, 3] / np.array(ranges_m)[:, None, None], -1, 0)
+    found[np.floor((np.arctan2(y, x) + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS] = True
+    return found
+
+
 class PairScans:
     """The obstacle grid of a run, the obstacles that move in it, and its scan at each pair that is added."""
 
@@ -94,7 +117,7 @@ class PairScans:
         self._of_floor: Floor | None = None  # for which the tables of the scans were made
         self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, settings)
         self._tracker = MovingTracker()
-        self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
+        self._T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
         self._resets = 0
 
     def add(self, odometry: OdometryUpdate, camera_floor: CameraFloor) -> ObstacleScan:
@@ -108,8 +131,9 @@ class PairScans:
         if is_again or is_lost:
             self._tracker.clear()
         panoramas, self.scans.belief = odometry.depth.panoramas, None
-        T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
-        tiles, unwatched = panoramas.tiles, self._unwatched.sectors(panoramas.tiles.unknown)
+        T_odom_base = frames.of_base(odometry, self._geometry.rig.T_base_rig)[0]
+        tiles, of_base = panoramas.tiles, (self._geometry.cylinder, self._T_base_rect)
+        unwatched = sectors_of(tiles.unknown, *of_base, UNWATCHED_M)
         unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         # 2. Tables of the floor.
         floor = camera_floor.floor
@@ -123,7 +147,7 @@ class PairScans:
         lost = tiles.lost_pixels(panoramas.visible.shape)
         scan = self.scans.add(odometry.stamp_ns, T_odom_base, panoramas.lower, panoramas.upper, lost)
         # 4. The moving obstacles.
-        scan.arrivals.ranges_m[self._unwatched.directions(tiles.unknown)] = np.nan
+        scan.arrivals.ranges_m[sectors_of(tiles.unknown, *of_base, (math.inf,))] = np.nan
         viewpoint = self.scans.grid.viewpoint(transform(planar(T_odom_base)))
         moving = self._tracker.update(odometry.stamp_ns, viewpoint, scan.arrivals)
         # 5. Nothing is said of directions in which the images show nothing to rely on.

@@ -1,4 +1,4 @@
-"""Compiled loops of the evidence along columns: sums of differences for each disparity, and their likelihoods.
+"""Compiled loops of the evidence along columns: sums of differences for each disparity, their likelihoods, and ramps.
 
 All loops over directions are innermost and without branches: the compiler turns them into vector instructions.
 """
@@ -15,6 +15,7 @@ from omnid.core.compiled import compiled, inner
 Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint16]
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 Numbers = NDArray[np.int32]
 
 LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
@@ -277,3 +278,64 @@ def surface_evidence(upright_sums: Words, plane_sums: Words, strips: Numbers, su
         blank = np.float32(2.0 * (fourth - 1.0 / fourth))
         for d in range(mine, last):
             add_run(value[d], value[d + 1], value[d + 2], total, blank, run[d], surface[d])
+
+
+@compiled(
+    "(u1[:, ::1], u1[:, ::1], u1[:, ::1], f4[::1], i4[:, ::1], f8[::1], f8, f8, f8, f8, f8, f8[::1], f8[::1],"
+    " f8[:, :, ::1], f8[:, :, ::1])",
+    writes=("ramps", "upright"),
+)
+def ramp_gains(
+    lower: Bytes,
+    upper: Bytes,
+    live: Bytes,
+    plane_rows: Floats,
+    parts: Numbers,
+    along: Doubles,
+    row0: float,
+    focal_px: float,
+    height_m: float,
+    baseline_m: float,
+    seen_m: float,
+    starts_m: Doubles,
+    slopes: Doubles,
+    ramps: Doubles,
+    upright: Doubles,
+) -> None:
+    """Write by how much the rows of parts of the way differ less on ramps, and on what is upright, than on the floor.
+
+    lower, upper, live (H, W): normalised panoramas, and 255 where pixels may be compared; plane_rows (H,): row of the
+    upper one that shows the floor of a row, row0: the horizon. parts (P, C): directions, along (W,): cosines of all
+    against the way. starts_m (X,), slopes (S,) of ramps, seen up to the range seen_m. ramps (P, X, S). upright
+    (P, K, H): by disparity, in each row above its foot.
+    """
+    height = len(lower)
+    for p in range(len(parts)):
+        ramps[p], upright[p] = 0.0, 0.0
+        for u in parts[p]:
+            for v in range(int(row0) + 1, height):
+                on_floor = plane_rows[v]
+                if live[v, u] == 0 or on_floor > height - 2:
+                    continue
+                fall, mine, most = v - row0, float(lower[v, u]), float(OUTLIER)
+                above = int(on_floor)
+                share = on_floor - above
+                floor = min(abs(mine - (1.0 - share) * upper[above, u] - share * upper[above + 1, u]), most)
+                for k in range(math.ceil(baseline_m / height_m * fall), min(upright.shape[1], height - v)):
+                    upright[p, k, v] += floor - min(abs(mine - upper[v + k, u]), most)
+                for x in range(len(starts_m)):
+                    # Before the start the floor is what it was.
+                    if fall * starts_m[x] > focal_px * height_m * along[u]:
+                        break
+                    for s in range(len(slopes)):
+                        lift = fall + focal_px * slopes[s] * along[u]
+                        below_m = height_m + slopes[s] * starts_m[x]
+                        if lift * seen_m < focal_px * below_m or lift <= 0.0:
+                            continue
+                        row = v + baseline_m * lift / below_m
+                        above = int(row)
+                        if above > height - 2:
+                            continue
+                        share = row - above
+                        shown = (1.0 - share) * upper[above, u] + share * upper[above + 1, u]
+                        ramps[p, x, s] += floor - min(abs(mine - shown), most)

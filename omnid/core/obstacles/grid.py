@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles import grid_kernels as kernels
+from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.moving_tracker import Arrivals, runs
 from omnid.core.obstacles.plane_view import AZIMUTHS, THIN_M
 from omnid.core.obstacles.posterior import RayBelief
@@ -86,7 +86,6 @@ class FloorGrid:
 
     corner_m: Array  # (2,) outer corner of the first cell in odom, x and y
     occupied: Floats  # (SIDE, SIDE) probability that something stands, hangs or steps there; NaN: unknown
-    age_s: Floats  # (SIDE, SIDE) since the pair that showed the cell, or floor past it, last; inf: none did
 
     @property
     def states(self) -> Bytes:
@@ -165,12 +164,11 @@ class ObstacleGrid:
 
     def _forget(self) -> None:
         """Forget everything."""
-        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)
+        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf], np.float32)
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
-        # views past it; whether the last pair saw floor behind it; times [s] since it was free, and since it was seen.
-        self.odds, self._before, self._shown, self._known, self._past_views, *others = self._layers
-        self._was_past, self._free_s, self._age_s = others
+        # views past it; whether the last pair saw floor behind it; time [s] since it was free.
+        self.odds, self._before, self._shown, self._known, self._past_views, self._was_past, self._free_s = self._layers
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
@@ -212,16 +210,14 @@ class ObstacleGrid:
             watched = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
             self._who_comes(passed_s, watched)
         self._was_past[:] = past
-        self._age_s += np.float32(passed_s)
-        self._age_s[observed | past] = 0
         self._known[flooded > 0] = 0
         # 5. Who has come, and the scan.
         taken = self._taken()
         arrivals = self._arrivals(passed_s, yaw, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
         self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN], taken[OWN, OWN] = p.arrival, 1, 0, 0
         assert self._cell is not None
-        cells = np.where(taken > 1, np.float32(np.nan), taken), self._age_s.copy()
-        grid = FloorGrid(np.asarray(CELL_M * (self._cell - REACH_CELLS), float), *cells)
+        cells = np.where(taken > 1, np.float32(np.nan), taken)
+        grid = FloorGrid(np.asarray(CELL_M * (self._cell - REACH_CELLS), float), cells)
         return GridScan(*self._ways(taken, self._in_cells(place_m), yaw), arrivals, grid)
 
     def is_floor(self, T_odom_base: Array, ranges_m: Array) -> Flags:

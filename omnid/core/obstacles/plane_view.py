@@ -24,7 +24,7 @@ from calib.panorama import Cylinder
 from drivers.jpeg import coding_sigma
 from omnid.core.obstacles import evidence_kernels as kernels
 from omnid.core.obstacles.evidence_kernels import UNITS
-from omnid.core.obstacles.ray_kernels import RayParameters, add_weighted_rows
+from omnid.core.obstacles.ray_kernels import PARAMETERS, add_weighted_rows
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -120,9 +120,10 @@ class ShownBins(NamedTuple):
     """What a pair shows of the bins (N, DIRECTIONS), from near to far."""
 
     seen: Flags  # bins in view of both cameras
-    floor: Floats  # log-likelihood ratios of the floor,
+    # Log-likelihood ratios of the floor, in a direction and those that follow it which something thin hides together,
+    floor: Floats
     levels: Floats  # (2, N, DIRECTIONS) of the floor to planes above and below it,
-    surface: Floats  # of surfaces,
+    surface: Floats  # of the best run of rows within the robot's heights,
     fits: Floats  # and of those of them that fit best
     steps: Floats  # of grey across the bins
     greys: Floats
@@ -134,16 +135,6 @@ class ShownBins(NamedTuple):
             np.where(where if mine.ndim > 1 else where[-1], theirs, mine)
             for mine, theirs in zip(self, other, strict=True)
         )
-
-
-class ColumnEvidence(NamedTuple):
-    """Log-likelihood ratios of K disparities and DIRECTIONS directions of the rectified frame; k = 0 is far."""
-
-    # (K, DIRECTIONS) of the floor from disparity k to k + 1, in a direction and those that follow it which something
-    # thin hides together.
-    floor: Floats
-    surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
-    level: Floats  # (2, K, DIRECTIONS) of the floor against planes that are just above and below it
 
 
 def floor_plane(T_rect_floor: Array) -> FloorPlane:
@@ -230,26 +221,8 @@ class PlaneView:
         sensor_grey = math.hypot(lower.noise_grey, upper.noise_grey)
         return WorkingPair(images[0], images[1], seen, sensor_grey, math.hypot(BAND_NOISE * sensor_grey, *coding_grey))
 
-    def evidence(self, pair: WorkingPair) -> ColumnEvidence:
-        """Return the evidence of stereo of a pair."""
-        live = pair.seen * np.uint8(255)
-        # 1. Surfaces. They fit a little at the next disparities, too.
-        surface = np.empty((self.disparities, DIRECTIONS), np.float32)
-        plane_sums = self._sum_differences(*pair.normalised(), live)
-        kernels.surface_evidence(self._sums, plane_sums, self._strips, surface)
-        nearer, farther = (np.roll(surface, shift, axis=0) for shift in (-1, 1))
-        surface = np.where((surface >= nearer) & (surface >= farther), surface, np.float32(0))
-        # 2. The floor, and planes beside it.
-        others, level = np.empty_like(surface), np.empty((2, *surface.shape), np.float32)
-        lower, upper = pair.normalised(BOUNDED_SIGMAS)
-        plane_sums, rows = self._sum_differences(lower, upper, live), self.plane_rows
-        tables = self._patches, self._offsets, self._prior
-        kernels.floor_evidence(lower, upper, live, self._sums, plane_sums, rows, *tables, others, level)
-        together = self._patches[:, kernels.PATCH_THIN, None].astype(np.float32)
-        return ColumnEvidence(-together * np.log(np.maximum(others, np.float32(LEAST_OTHERS))), surface, level)
-
-    def shown(self, pair: WorkingPair, parameters: RayParameters) -> ShownBins:
-        """Return what a pair shows of the bins, by its greys and its stereo evidence."""
+    def shown(self, pair: WorkingPair) -> ShownBins:
+        """Return what a pair shows of the bins, by its greys and by stereo."""
         # 1. Steps of grey, and greys.
         count, numbers = len(self.bins.numbers), self.bins.numbers
         steps, greys = np.zeros((2, self._step_weights.shape[1], DIRECTIONS), np.float32)
@@ -257,18 +230,32 @@ class PlaneView:
             for of_view, image in zip(weights, (pair.lower, pair.upper), strict=True):
                 add_weighted_rows(of_view, image, into)
         far = np.abs(pooled(steps[count:])).max(axis=0, initial=0.0)
-        # 2. Stereo. A surface that fits at a whole disparity is within half of one of it.
-        evidence, of_bin = self.evidence(pair), numbers // BINS_PER_PX
-        of_surface = np.minimum((numbers + 1) // BINS_PER_PX, self.disparities - 1)
-        stereo = evidence.floor[of_bin], evidence.level[:, of_bin], evidence.surface[of_surface]
+        # 2. Surfaces. They fit a little at the next disparities, too.
+        live = pair.seen * np.uint8(255)
+        surface = np.empty((self.disparities, DIRECTIONS), np.float32)
+        plane_sums = self._sum_differences(*pair.normalised(), live)
+        kernels.surface_evidence(self._sums, plane_sums, self._strips, surface)
+        nearer, farther = (np.roll(surface, shift, axis=0) for shift in (-1, 1))
+        surface = np.where((surface >= nearer) & (surface >= farther), surface, np.float32(0))
         # 3. A surface that fits best in the weighted mean of neighbours counts as one.
-        most = np.minimum(evidence.surface, parameters.surface_most)
+        most = np.minimum(surface, PARAMETERS.surface_most)
         three = np.maximum(most, np.maximum(np.roll(most, 1, 0), np.roll(most, -1, 0)))
-        half = int(parameters.wide_columns) // 2
+        half = int(PARAMETERS.wide_columns) // 2
         wide = cv2.blur(turned(three, half), (2 * half + 1, 1), borderType=cv2.BORDER_REPLICATE)[:, half:-half]
         is_best = wide >= np.maximum(np.roll(wide, 1, 0), np.roll(wide, -1, 0))
-        fits = np.where(is_best, np.maximum(most, parameters.wide_weight * wide), most)[of_surface]
-        return ShownBins(self._of_bins(pair.seen), *stereo, fits, steps[:count], greys[:count], far)
+        fits = np.where(is_best, np.maximum(most, PARAMETERS.wide_weight * wide), most)
+        # 4. The floor, and planes beside it.
+        others, levels = np.empty_like(surface), np.empty((2, *surface.shape), np.float32)
+        lower, upper = pair.normalised(BOUNDED_SIGMAS)
+        plane_sums, rows = self._sum_differences(lower, upper, live), self.plane_rows
+        tables = self._patches, self._offsets, self._prior
+        kernels.floor_evidence(lower, upper, live, self._sums, plane_sums, rows, *tables, others, levels)
+        together = self._patches[:, kernels.PATCH_THIN, None].astype(np.float32)
+        floor = -together * np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
+        # 5. By bins. A surface that fits at a whole disparity is within half of one of it.
+        at, of_surface = numbers // BINS_PER_PX, np.minimum((numbers + 1) // BINS_PER_PX, self.disparities - 1)
+        stereo = floor[at], levels[:, at], surface[of_surface], fits[of_surface]
+        return ShownBins(self._of_bins(pair.seen), *stereo, steps[:count], greys[:count], far)
 
     def _of_bins(self, pixels: Flags) -> Flags:
         """Return bins (N, DIRECTIONS) whose pixels (H, DIRECTIONS) in both views are set."""

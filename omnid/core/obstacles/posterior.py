@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.plane_view import AZIMUTHS, BINS_PER_PX, DIRECTIONS, Bins, ShownBins, pooled, turned
-from omnid.core.obstacles.ray_kernels import RayParameters
+from omnid.core.obstacles.ray_kernels import PARAMETERS as P
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -76,136 +76,123 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
     return found
 
 
-class RayPosterior:
-    """Posterior of the bins of pairs."""
+def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -> RayBelief:
+    """Return the belief by what a pair shows of the bins; sensor_grey: noise of the difference of two pixels.
 
-    def __init__(self, bins: Bins, parameters: RayParameters) -> None:
-        self._bins, self._p = bins, parameters
-        self._lengths_m = np.diff(bins.ends_m).astype(np.float32)
-        along = np.abs(np.sin(AZIMUTHS)) < math.sin(ALONG_RAD)
-        self._assumed = (bins.ranges_m < parameters.look_m)[:, None] & along
-
-    def belief(self, shown: ShownBins, sensor_grey: float, known: Flags | None = None) -> RayBelief:
-        """Return the belief by what a pair shows of the bins; sensor_grey: noise of the difference of two pixels.
-
-        known (N, DIRECTIONS): bins that are known to be floor, None: the nearest ahead and behind are taken for it.
-        """
-        p, count, ranges_m = self._p, len(self._bins.ranges_m), self._bins.ranges_m
-        # 1. The floor by which its look is learned: of the cells that are known, or assumed where these are few.
-        known = self._assumed & shown.seen if known is None else known & shown.seen
-        near = known & (ranges_m < p.look_m)[:, None]
-        if near.sum() < p.look_bins:
-            known = near = self._assumed & shown.seen
-        if near.sum() < p.look_bins:
-            return self._nothing()
-        # 2. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
-        #    says by how much.
-        floor = shown.floor - np.float32(min(max(float(np.median(shown.floor[near])), -1.0), 0.0))
-        floor = p.w_floor * np.clip(floor, -p.floor_most, p.floor_most)
-        # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L
-        # counts by the odds that it is more than that.
-        levels = shown.levels
-        noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
-        levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
-        levels = floor - p.w_level * np.clip(levels, -p.level_most, p.level_most)
-        fits = np.minimum(shown.fits, p.surface_most) - p.surface_noise
-        # 3. Edges and look, by those of the floor.
-        steps, greys = pooled(shown.steps), shown.greys
-        sigmas = self._step_sigmas(steps, near, known)
-        marks = float((np.abs(steps) > 5 * sigmas)[near].mean())
-        marks = min((p.marks + 2 * marks) / 3, 0.5)
-        plain = max(p.noise_share * sensor_grey, LEAST_STEP)
-        edges = self._edges(np.abs(steps), greys, sigmas, marks, plain)
-        look = self._look(shown.steps, greys, near & (ranges_m < 1.6)[:, None])
-        far = (shown.far / max(float(sigmas[-1, 0]), float(sigmas.min()))).astype(np.float32)
-        # 4. The posterior.
-        seen = shown.seen & (greys < SATURATED)
-        terms = np.where(seen, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
-        terms[kernels.FITS] = fits
-        first = np.empty((DIRECTIONS, count + 1), np.float32)
-        ratios, view = np.empty((2, DIRECTIONS, count), np.float32)
-        kernels.posterior(terms, self._lengths_m, far, float(self._bins.ends_m[0]), p, first, ratios, view)
-        surfaces = np.ascontiguousarray(shown.surface.T)
-        return RayBelief(first, ratios, np.where(seen.T, view, np.float32(0)), surfaces, self._bins.ends_m)
-
-    def _step_sigmas(self, steps: Floats, near: Flags, known: Flags) -> Floats:
-        """Return the sigmas (N, 1) of steps (N, D) of the floor at each range, within twice that of near ones."""
-        p = self._p
-        least = max(_sigma_of(steps[near]), LEAST_STEP)
-        followed = np.full(len(steps), least)
-        last, of_rows, counts = least, MAD * _row_medians(np.abs(steps), known), known.sum(axis=1)
-        for n in range(len(steps)):
-            if counts[n] >= p.look_bins:
-                last = (last + of_rows[n]) / 2
-            followed[n] = last
-        return np.asarray(np.clip(followed, max(least / 2, LEAST_STEP), 2 * least)[:, None], np.float32)
-
-    def _edges(self, steps: Floats, greys: Floats, sigmas: Floats, marks: float, plain: float) -> tuple[Floats, ...]:
-        """Return log-ratios (N, D) to something hidden, by steps: of floor, of something plain, and of what begins.
-
-        sigmas (N, 1) of steps of the floor; marks: its rate of edges; plain: sigma of steps without any texture.
-        """
-        p, scale = self._p, np.asarray(self._p.contrast * np.maximum(greys, 20.0), np.float32)
-
-        def behind(step: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-            """Return the densities of steps of texture, of texture or none, of what is hidden, and of edges."""
-            textured, other = _noise(step, sigmas, p.tail), _laplace(step, scale)
-            even = (1 - p.plain_behind) * textured + p.plain_behind * _noise(step, np.float32(plain), p.tail)
-            return textured, even, (1 - p.marks_behind) * even + p.marks_behind * other, other
-
-        *_, hidden, begins = behind(steps)
-        # Windows of neighbouring bins overlap: an edge is one event, where it is largest.
-        largest = cv2.dilate(steps, np.ones((5, 1), np.uint8), borderType=cv2.BORDER_REPLICATE)
-        once = np.asarray(np.where((steps < largest) & (steps > 2 * sigmas), 2 * sigmas, steps), np.float32)
-        textured, even, other_hidden, other = behind(once)
-        floor = p.w_edge * np.log(((1 - marks) * textured + marks * other) / other_hidden)
-        bare = p.w_edge * np.log(((1 - p.marks_plain) * even + p.marks_plain * other) / other_hidden)
-        return np.asarray(floor, np.float32), np.asarray(bare, np.float32), np.log(begins / hidden)
-
-    def _look(self, steps: Floats, greys: Floats, near: Flags) -> Floats:
-        """Return the log-ratios (N, D) that a bin looks like known floor near to the base, to anything: by contrast, by
-        the difference of its grey to both sides, and by its grey.
-
-        near (N, D): bins that are known to be floor. Far away the same floor shows less contrast, in other light.
-        """
-        p, far = self._p, np.maximum(self._bins.ranges_m / TYPICAL_M, 1.0)[:, None].astype(np.float32)
-        grey = float(np.median(greys[near]))
-        scale = np.float32(p.contrast * max(grey, 20.0))
-        # 1. The size of steps around.
-        size2 = np.asarray(cv2.blur(turned(steps * steps, 1), (3, 5))[:, 1:-1], np.float32)
-        contrast = np.asarray(np.log(np.sqrt(size2) + np.float32(0.3)), np.float32)
-        z = np.asarray(contrast - np.median(contrast[near]), np.float32)
-        sigma = np.float32(max(_sigma_of(z[near]), 0.25))
-        anything = _noise(contrast - 1, np.float32(1.3), 0.0)
-        by_contrast = _alike(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0), anything)
-        # 2. The difference to both sides, of a bin or of five, whichever is less. A thing shows an outline in half of
-        #    its directions.
-        side = turned(greys, SIDE)
-        one = greys - (side[:, : -2 * SIDE] + side[:, 2 * SIDE :]) / 2
-        five = cv2.blur(one, (1, 5))
-        outline = np.asarray(np.where(np.abs(one) < np.abs(five), one, five), np.float32)
-        core = _noise(outline, np.float32(max(_sigma_of(outline[near]), 0.8)) * np.sqrt(far), p.tail)
-        by_outline = _alike(core, np.float32(0.5) * (core + _laplace(np.abs(outline), scale)))
-        # 3. The grey, by that of the floor at the same range where it is known.
-        middles = np.full((len(greys), 1), grey, np.float32)
-        sigmas = np.full_like(middles, max(_sigma_of(greys[near] - grey), p.grey_share * grey))
-        known = near.sum(axis=1) > p.look_bins
-        middles[known, 0] = _row_medians(greys[known], near[known])
-        of_rows = MAD * _row_medians(np.abs(greys[known] - middles[known]), near[known])
-        sigmas[known, 0] = np.clip(of_rows, p.near_grey_share * grey, sigmas[known, 0])
-        z = greys - middles
-        by_grey = _alike(_noise(z, sigmas, 0.0), _laplace(np.abs(z), 1.5 * scale))
-        # Far away the light of the near floor is all that is known.
-        lowest = p.look_low * (1 + known[:, None])
-        total = np.clip(by_contrast, p.look_low, p.look_high) + np.clip(by_outline, p.look_low, p.look_high)
-        return np.asarray(p.w_look * (total + np.clip(by_grey, lowest, p.look_high)), np.float32)
-
-    def _nothing(self) -> RayBelief:
-        """Return the belief by a pair that shows no floor."""
-        count = len(self._bins.ranges_m)
-        first, zero = np.zeros((DIRECTIONS, count + 1), np.float32), np.zeros((DIRECTIONS, count), np.float32)
+    known (N, DIRECTIONS): bins that are known to be floor.
+    """
+    ranges_m = bins.ranges_m[:, None]
+    # 1. The floor by which its look is learned: of the cells that are known, or the nearest ahead and behind where
+    #    these are few.
+    known = known & shown.seen
+    near = known & (ranges_m < P.look_m)
+    if near.sum() < P.look_bins:
+        known = near = shown.seen & (ranges_m < P.look_m) & (np.abs(np.sin(AZIMUTHS)) < math.sin(ALONG_RAD))
+    first = np.zeros((DIRECTIONS, len(ranges_m) + 1), np.float32)
+    ratios, view = np.zeros((2, DIRECTIONS, len(ranges_m)), np.float32)
+    if near.sum() < P.look_bins:  # The pair shows no floor.
         first[:, -1] = 1.0
-        return RayBelief(first, zero, zero, zero, self._bins.ends_m)
+        return RayBelief(first, ratios, view, view, bins.ends_m)
+    # 2. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor says by
+    #    how much.
+    floor = shown.floor - np.float32(min(max(float(np.median(shown.floor[near])), -1.0), 0.0))
+    floor = P.w_floor * np.clip(floor, -P.floor_most, P.floor_most)
+    # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L counts
+    # by the odds that it is more than that.
+    levels = shown.levels
+    noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
+    levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
+    levels = floor - P.w_level * np.clip(levels, -P.level_most, P.level_most)
+    fits = np.minimum(shown.fits, P.surface_most) - P.surface_noise
+    # 3. Edges and look, by those of the floor.
+    steps, greys = pooled(shown.steps), shown.greys
+    sigmas = _step_sigmas(steps, near, known)
+    marks = float((np.abs(steps) > 5 * sigmas)[near].mean())
+    plain = max(P.noise_share * sensor_grey, LEAST_STEP)
+    edges = _edges(np.abs(steps), greys, sigmas, min((P.marks + 2 * marks) / 3, 0.5), plain)
+    look = _look(shown.steps, greys, near & (ranges_m < 1.6), np.maximum(ranges_m / TYPICAL_M, 1.0).astype(np.float32))
+    far = (shown.far / max(float(sigmas[-1, 0]), float(sigmas.min()))).astype(np.float32)
+    # 4. The posterior.
+    seen = shown.seen & (greys < SATURATED)
+    terms = np.where(seen, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
+    terms[kernels.FITS] = fits
+    lengths_m = np.diff(bins.ends_m).astype(np.float32)
+    kernels.posterior(terms, lengths_m, far, float(bins.ends_m[0]), first, ratios, view)
+    surfaces = np.ascontiguousarray(shown.surface.T)
+    return RayBelief(first, ratios, np.where(seen.T, view, np.float32(0)), surfaces, bins.ends_m)
+
+
+def _step_sigmas(steps: Floats, near: Flags, known: Flags) -> Floats:
+    """Return the sigmas (N, 1) of steps (N, D) of the floor at each range, within twice that of near ones."""
+    last = least = max(_sigma_of(steps[near]), LEAST_STEP)
+    followed = np.full((len(steps), 1), least, np.float32)
+    for n, (sigma, count) in enumerate(zip(MAD * _row_medians(np.abs(steps), known), known.sum(axis=1), strict=True)):
+        if count >= P.look_bins:
+            last = (last + sigma) / 2
+        followed[n] = last
+    return np.clip(followed, np.float32(max(least / 2, LEAST_STEP)), np.float32(2 * least))
+
+
+def _edges(steps: Floats, greys: Floats, sigmas: Floats, marks: float, plain: float) -> tuple[Floats, ...]:
+    """Return log-ratios (N, D) to something hidden, by steps: of floor, of something plain, and of what begins.
+
+    sigmas (N, 1) of steps of the floor; marks: its rate of edges; plain: sigma of steps without any texture.
+    """
+    scale = np.asarray(P.contrast * np.maximum(greys, 20.0), np.float32)
+
+    def behind(step: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return the densities of steps of texture, of texture or none, of what is hidden, and of edges."""
+        textured, other = _noise(step, sigmas, P.tail), _laplace(step, scale)
+        even = (1 - P.plain_behind) * textured + P.plain_behind * _noise(step, np.float32(plain), P.tail)
+        return textured, even, (1 - P.marks_behind) * even + P.marks_behind * other, other
+
+    *_, hidden, begins = behind(steps)
+    # Windows of neighbouring bins overlap: an edge is one event, where it is largest.
+    largest = cv2.dilate(steps, np.ones((5, 1), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    once = np.asarray(np.where((steps < largest) & (steps > 2 * sigmas), 2 * sigmas, steps), np.float32)
+    textured, even, other_hidden, other = behind(once)
+    floor = P.w_edge * np.log(((1 - marks) * textured + marks * other) / other_hidden)
+    bare = P.w_edge * np.log(((1 - P.marks_plain) * even + P.marks_plain * other) / other_hidden)
+    return np.asarray(floor, np.float32), np.asarray(bare, np.float32), np.log(begins / hidden)
+
+
+def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
+    """Return the log-ratios (N, D) that a bin looks like known floor near to the base, to anything: by contrast, by the
+    difference of its grey to both sides, and by its grey.
+
+    near (N, D): bins that are known to be floor. far (N, 1): by so much farther the same floor shows less contrast, in
+    other light.
+    """
+    grey = float(np.median(greys[near]))
+    scale = np.float32(P.contrast * max(grey, 20.0))
+    # 1. The size of steps around.
+    size2 = np.asarray(cv2.blur(turned(steps * steps, 1), (3, 5))[:, 1:-1], np.float32)
+    contrast = np.asarray(np.log(np.sqrt(size2) + np.float32(0.3)), np.float32)
+    z = np.asarray(contrast - np.median(contrast[near]), np.float32)
+    sigma = np.float32(max(_sigma_of(z[near]), 0.25))
+    anything = _noise(contrast - 1, np.float32(1.3), 0.0)
+    by_contrast = _alike(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0), anything)
+    # 2. The difference to both sides, of a bin or of five, whichever is less. A thing shows an outline in half of its
+    #    directions.
+    side = turned(greys, SIDE)
+    one = greys - (side[:, : -2 * SIDE] + side[:, 2 * SIDE :]) / 2
+    five = cv2.blur(one, (1, 5))
+    outline = np.asarray(np.where(np.abs(one) < np.abs(five), one, five), np.float32)
+    core = _noise(outline, np.float32(max(_sigma_of(outline[near]), 0.8)) * np.sqrt(far), P.tail)
+    by_outline = _alike(core, np.float32(0.5) * (core + _laplace(np.abs(outline), scale)))
+    # 3. The grey, by that of the floor at the same range where it is known.
+    middles = np.full((len(greys), 1), grey, np.float32)
+    sigmas = np.full_like(middles, max(_sigma_of(greys[near] - grey), P.grey_share * grey))
+    known = near.sum(axis=1) > P.look_bins
+    middles[known, 0] = _row_medians(greys[known], near[known])
+    of_rows = MAD * _row_medians(np.abs(greys[known] - middles[known]), near[known])
+    sigmas[known, 0] = np.clip(of_rows, P.near_grey_share * grey, sigmas[known, 0])
+    z = greys - middles
+    by_grey = _alike(_noise(z, sigmas, 0.0), _laplace(np.abs(z), 1.5 * scale))
+    # Far away the light of the near floor is all that is known.
+    lowest = P.look_low * (1 + known[:, None])
+    total = np.clip(by_contrast, P.look_low, P.look_high) + np.clip(by_outline, P.look_low, P.look_high)
+    return np.asarray(P.w_look * (total + np.clip(by_grey, lowest, P.look_high)), np.float32)
 
 
 def _noise(values: Floats, sigma: Floats | np.float32, tail: float) -> Floats:

@@ -5,14 +5,20 @@ f t / h (a cos u + b sin u), whatever their range. So the difference of both vie
 columns, is a linear measurement of a and b, and a Kalman filter adds up pairs. Floor without texture has no gradient,
 and changes nothing. Only floor nearer than where a step down looks like a tilt counts, and only where it is known.
 
-A ramp (ramps.py) is a second plane beyond a line. While a base drives over that line it stands on neither plane: then
-its own pose says where both are.
+A ramp of slope s that begins x_0 ahead lies on a plane of its own: z = -(h + s x_0) + r (a + s) cos(u), about the
+viewpoint, over a floor z = -h + r a cos(u). So it has a disparity in each row, too, and both planes are compared, pixel
+by pixel, in the rows beyond the line. Of all (x_0, s) the likeliest is taken, where it explains those rows better than
+the floor, and than anything upright, in most directions: what is narrower than the way, such as a box, is no ramp, and
+neither is a wall.
+A ramp goes up by at most what may be driven; and down by at most what the base has climbed: a landing. Any other fall
+is an edge.
+While a base drives over the line it stands on neither plane: then its own pose says where both are.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,10 +27,12 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from calib.se2_arrays import planar, transform
+from omnid.core.obstacles.evidence_kernels import UNITS, ramp_gains
 from omnid.core.obstacles.grid import GridScan, ObstacleGrid, unknown_scan
 from omnid.core.obstacles.plane_view import (
     AROUND_ROWS,
     AZIMUTHS,
+    BOUNDED_SIGMAS,
     FOCAL_PX,
     Bins,
     FloorPlane,
@@ -32,9 +40,7 @@ from omnid.core.obstacles.plane_view import (
     WorkingPair,
     floor_plane,
 )
-from omnid.core.obstacles.posterior import RayBelief, RayPosterior
-from omnid.core.obstacles.ramps import Ramp, Ramps
-from omnid.core.obstacles.ray_kernels import RayParameters
+from omnid.core.obstacles.posterior import RayBelief, ray_belief
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -51,7 +57,107 @@ LEAST_M: Final = 0.005  # and of a height
 CORRELATED: Final = 20.0  # pixels with one error: neighbours are smoothed, and share what is wrong
 HALF_BASE_M: Final = 0.5  # From a line so far on, a base stands with all wheels on one side of it.
 FOUND_M: Final = 1.0  # A ramp that begins nearer is known: what is left of the floor before it tells no start.
-PARAMETERS: Final = RayParameters()
+STEEPEST: Final = math.tan(math.radians(10.0))  # ramp that may be driven,
+TOO_STEEP: Final = np.tan(np.radians(np.arange(12.0, 21.0, 2.0)))  # and others, for which it must not be taken
+GENTLEST: Final = math.tan(math.radians(1.0))  # The filter of the tilt follows what is less.
+STEP: Final = math.tan(math.radians(0.5))  # between slopes that are compared
+STARTS_M: Final = np.arange(0.6, 3.3, 0.1)  # where ramps are looked for: nearer ones are known by their pairs before
+SEEN_M: Final = 4.0  # range up to which they are seen
+HALF_RAD: Final = math.radians(27.0)  # half of the angle in which a ramp is as wide as the way
+PARTS: Final = 8  # of that angle: most of them must show a ramp
+# Log-likelihood by a sigma of difference of a pixel: that of evidence_kernels.py with its weight in the posterior.
+RATIO: Final = 0.075
+LEAST_NATS: Final = 10.0  # Evidence of a ramp in one pair: without one it is below 4 in textured corridors.
+SAME_M, SAME = 0.5, math.tan(math.radians(3.0))  # within which pairs show the same ramp
+VIEWS: Final = 3.0  # Pairs that count: nearer ones show a ramp better.
+
+
+class Ramp(NamedTuple):
+    """The floor beyond a line across a way, about the viewpoint of a pair."""
+
+    start_m: float  # of the line, along the way; below 0: behind
+    slope: float  # along the way, against the floor before the line
+    way_rad: float  # azimuth of the way in the rectified frame
+
+    def plane(self, floor: FloorPlane) -> FloorPlane:
+        """Return the plane of the ramp, which begins on a floor."""
+        a, b = floor.a + self.slope * math.cos(self.way_rad), floor.b + self.slope * math.sin(self.way_rad)
+        return FloorPlane(floor.height_m + self.slope * self.start_m, a, b)
+
+    def begins_before(self, ranges_m: Array) -> Flags:
+        """Return whether places at ranges (N,) are beyond the line (N, DIRECTIONS)."""
+        return np.asarray(np.outer(ranges_m, np.cos(AZIMUTHS - self.way_rad)) > self.start_m)
+
+
+class Ramps:
+    """The ramp before a base, or that which it drives onto, by all pairs."""
+
+    def __init__(self) -> None:
+        self.way_rad, self.offset_m = 0.0, 0.0  # azimuth of the way in odom, and offset of the line along it
+        self._slope, self._nats = 0.0, 0.0  # and evidence by all pairs; 0: no ramp is known
+
+    def forget(self) -> None:
+        """Forget the ramp that is known."""
+        self._nats = 0.0
+
+    def seen_from(self, viewpoint: Array, turn_rad: float) -> Ramp | None:
+        """Return the ramp that is known, from a viewpoint (x, y, heading) in odom; turn_rad: of odom in the rectified
+        frame."""
+        if not self._nats:
+            return None
+        return Ramp(self.offset_m - self._along(viewpoint, self.way_rad), self._slope, self.way_rad + turn_rad)
+
+    def search(self, pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: float, climbed: float) -> bool:
+        """Search for a ramp ahead in a pair on the floor before it; return whether it is a new one.
+
+        viewpoint: x, y, heading in odom; turn_rad: of odom in the rectified frame; climbed: slope of the base in odom.
+        """
+        # 1. Gains of all ramps in parts of the way.
+        aside = np.angle(np.exp(1j * (AZIMUTHS - viewpoint[2] - turn_rad)))
+        order = np.argsort(aside)
+        ahead = order[np.abs(aside[order]) < HALF_RAD]
+        parts = ahead[: len(ahead) // PARTS * PARTS].reshape(PARTS, -1)[:, ::2].astype(np.int32)
+        slopes = np.append(np.arange(GENTLEST, STEEPEST + STEP / 2, STEP), TOO_STEEP)
+        if climbed > GENTLEST:  # A landing is level.
+            slopes = np.append(slopes, STEP * np.arange(-2, 3) - climbed)
+        ramps = np.empty((PARTS, len(STARTS_M), len(slopes)))
+        upright = np.empty((PARTS, math.ceil(view.at_1m / STARTS_M[0]), view.height))
+        live, height_m = pair.seen * np.uint8(255), view.plane.height_m
+        images = *pair.normalised(BOUNDED_SIGMAS), live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
+        geometry = view.row0, FOCAL_PX, height_m, view.at_1m / FOCAL_PX, SEEN_M
+        ramp_gains(*images, *geometry, STARTS_M, slopes, ramps, upright)
+        # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
+        sums = np.pad(np.cumsum(upright, axis=2), ((0, 0), (0, 0), (1, 0)))
+        below_m = height_m + np.outer(STARTS_M, slopes)
+        far = np.ceil(view.row0 + FOCAL_PX * (below_m / SEEN_M - slopes)).astype(int)
+        near = np.floor(view.row0 + FOCAL_PX * height_m / STARTS_M).astype(int)[:, None]
+        ends = (np.clip(rows, int(view.row0), view.height) for rows in (near + 1, far))
+        things = np.subtract(*(sums[:, :, rows] for rows in ends)).max(axis=1)
+        # 3. The likeliest, which most parts show. Every second direction was looked at.
+        nats = 2 * RATIO / UNITS * PARTS * np.median(ramps - np.maximum(things, 0), axis=0)
+        x, s = np.unravel_index(nats.argmax(), nats.shape)
+        if nats[x, s] < LEAST_NATS or slopes[s] >= TOO_STEEP[0]:
+            return False
+        offset_m = float(STARTS_M[x]) + self._along(viewpoint, viewpoint[2])
+        return self._add(float(viewpoint[2]), offset_m, float(slopes[s]), float(nats[x, s]))
+
+    def _add(self, way_rad: float, offset_m: float, slope: float, nats: float) -> bool:
+        """Take what a pair shows into the mean of those that showed the same ramp, weighted by their evidence; return
+        whether it is a new one."""
+        is_same = abs(offset_m - self.offset_m) < SAME_M and abs(slope - self._slope) < SAME
+        if not self._nats or not is_same or math.cos(way_rad - self.way_rad) < math.cos(HALF_RAD):
+            self.way_rad, self.offset_m, self._slope, self._nats = way_rad, offset_m, slope, nats
+            return True
+        self._nats = min(self._nats, (VIEWS - 1) * nats) + nats
+        share = nats / self._nats
+        self.offset_m += share * (offset_m - self.offset_m)
+        self._slope += share * (slope - self._slope)
+        return False
+
+    @staticmethod
+    def _along(place: Array, way_rad: float) -> float:
+        """Return how far a place is along a way in odom [m]."""
+        return float(place[0] * math.cos(way_rad) + place[1] * math.sin(way_rad))
 
 
 class RayScans:
@@ -77,7 +183,6 @@ class RayScans:
         self._bins = None
         self._floor = self._ramp = self._view(floor_plane(T_rect_base))
         self._bins = self._floor.bins
-        self._posterior = RayPosterior(self._bins, PARAMETERS)
 
     def begin_again(self) -> None:
         """Forget what is known in odom, as the way since then is not."""
@@ -109,14 +214,14 @@ class RayScans:
             return unknown_scan()
         # 2. What the pair shows on them.
         pair = self._floor.pair(lower, upper, lost)
-        shown = self._floor.shown(pair, PARAMETERS)
+        shown = self._floor.shown(pair)
         if ramp is not None:
             self._ramp = self._seen(ramp.plane(floor), self._ramp)
-            on_ramp = self._ramp.shown(self._ramp.pair(lower, upper, lost), PARAMETERS)
+            on_ramp = self._ramp.shown(self._ramp.pair(lower, upper, lost))
             shown = shown.beyond(ramp.begins_before(self._floor.bins.ranges_m), on_ramp)
         # 3. The belief, with the look of floor that is known, and the grid.
         known = self.grid.is_floor(pose, self._floor.bins.ranges_m)
-        self.belief = self._posterior.belief(shown, pair.sensor_grey, known)
+        self.belief = ray_belief(shown, self._floor.bins, pair.sensor_grey, known)
         scan = self.grid.update(stamp_ns, pose, self.belief)
         # 4. Tilt and ramps, for the next pair.
         is_due = self._followed_ns is None or not 0 <= stamp_ns - self._followed_ns < FOLLOWED_NS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,11 +14,12 @@ from omnid.config import load_config
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.grid import FREE, OCCUPIED, REACH_CELLS, UNKNOWN
 from omnid.core.obstacles.settings import ScanSettings
+from omnid.core.stereo.tiles import TILE_COLUMNS
 from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate, Panoramas, StereoDepth
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
-from omnid.stages.obstacles import CameraFloor, PairScans
+from omnid.stages.obstacles import UNWATCHED_M, CameraFloor, PairScans, sectors_of
 from omnid.stages.places import keyframe_ranges
 from omnid.tracking_state import TrackingState
 from tests.omnid.core import test_floor
@@ -132,7 +134,6 @@ def test_grid_has_floor_before_a_wall_the_wall_and_nothing_known_behind() -> Non
     assert scan.grid.states[ahead].tolist() == [FREE, FREE, UNKNOWN]
     row, columns = scan.grid.at(np.array([[x_m + 1.9, 0.0], [x_m + 2.1, 0.0]]))
     assert (scan.grid.states[row[0], columns[0] : columns[1] + 1] == OCCUPIED).any()
-    assert scan.grid.age_s[ahead][1] == 0.0 and np.isinf(scan.grid.age_s[ahead][2])
 
 
 @pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
@@ -167,6 +168,27 @@ def test_what_is_known_stays_at_its_place_in_odom_as_the_base_moves(x_m: float, 
     assert scan.ranges_m[180] == pytest.approx(0.575 - x_m, abs=0.04)
     assert scan.ranges_m[270] == pytest.approx(0.775 - y_m, abs=0.04)
     assert min(scan.free_m[0], scan.free_m[90]) > 1.5
+
+
+DEAD = np.zeros(TILE_COLUMNS, bool)
+DEAD[27:33] = True  # 36 degrees about azimuth 0, which is in the middle of the panorama
+
+
+def test_columns_of_tiles_are_sectors_about_the_same_azimuth() -> None:
+    """The middle of the panorama is ahead, and azimuth falls from left to right."""
+    found = np.flatnonzero(sectors_of(DEAD, CYLINDER, np.eye(4), UNWATCHED_M))
+    assert found.min() in (161, 162) and found.max() in (197, 198) and len(found) <= 38
+    left = np.zeros(TILE_COLUMNS, bool)
+    left[14] = True
+    assert (np.flatnonzero(sectors_of(left, CYLINDER, np.eye(4), UNWATCHED_M)) - 180 > 80).all()
+
+
+def test_tiles_of_a_viewpoint_beside_the_origin_cover_near_and_far_directions() -> None:
+    """Cameras 0.3 m to the left: what is ahead of them is to the left of the base where it is near."""
+    found = sectors_of(DEAD, CYLINDER, se3.transform(np.eye(3), [0.0, 0.3, 0.9]), UNWATCHED_M)
+    for range_m in (0.6, 1.2, 4.0):
+        azimuth = math.atan2(0.3, range_m)
+        assert found[math.floor((azimuth + math.pi) * SECTORS / math.tau)], range_m
 
 
 ROOM_HEIGHT_M = test_floor.HEIGHT_M

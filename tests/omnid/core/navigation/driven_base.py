@@ -61,7 +61,7 @@ class Floor:
         at = np.flatnonzero(np.isfinite(ranges_m))
         angles = pose[2] - math.pi + (at + 0.5) * (math.tau / 360)
         points = pose[:2] + ranges_m[at, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-        grid = FloorGrid(corner_m, self._states.copy(), np.zeros(self._states.shape, np.float32))
+        grid = FloorGrid(corner_m, self._states.copy())
         rows, columns = grid.at(points)
         inside = (np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < self._side)
         grid.occupied[rows[inside], columns[inside]] = 1.0

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.frame import Frame, coding_steps
-from omnid.core.obstacles.plane_view import ColumnEvidence, PlaneView, floor_plane
+from omnid.core.obstacles.plane_view import PlaneView, ShownBins, floor_plane
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.obstacles.drawn_floor import (
@@ -35,47 +35,50 @@ def made(visible: NDArray[np.bool_] = VISIBLE) -> PlaneView:
 
 
 VIEW = made()
+DISPARITIES = (VIEW.bins.numbers + 0.5) / 2
 
 
-def seen(view: PlaneView, pair: tuple[PaddedPanorama, PaddedPanorama]) -> ColumnEvidence:
-    return view.evidence(view.pair(*pair))
+def seen(view: PlaneView, pair: tuple[PaddedPanorama, PaddedPanorama]) -> ShownBins:
+    return view.shown(view.pair(*pair))
 
 
-def evidence(view: PlaneView, floor: Pattern, wall: Pattern, drop_m: float = 0.0) -> ColumnEvidence:
+def between(near_m: float, far_m: float) -> NDArray[np.bool_]:
+    """Return the bins of ranges."""
+    return np.asarray((VIEW.bins.ranges_m > near_m) & (VIEW.bins.ranges_m < far_m))
+
+
+def evidence(view: PlaneView, floor: Pattern, wall: Pattern, drop_m: float = 0.0) -> ShownBins:
     return seen(view, panoramas(floor, WALL_M, wall, drop_m))
 
 
 def test_wall_of_courses_that_are_all_alike_is_none_farther_away_below_the_floor() -> None:
     """By another number of courses it fits farther away, but not near its foot: there the floor would be above it."""
     found = seen(VIEW, panoramas(stains, 1.2, courses))
-    at = round(VIEW.at_1m / 1.2)
-    assert (found.surface[at - 2 : at + 3].max(axis=0) > 2).mean() > 0.95
-    assert (found.surface[at + 3 :] > 2).mean() < 0.01
+    apart = DISPARITIES - VIEW.at_1m / 1.2
+    assert (found.surface[np.abs(apart) < 2.5].max(axis=0) > 2).mean() > 0.95
+    assert (found.surface[apart > 3] > 2).mean() < 0.01
 
 
 @pytest.mark.parametrize(("drop_m", "others"), [(0.08, 1), (-0.08, 0)])
 def test_low_steps_are_not_the_floor(drop_m: float, others: int) -> None:
     """8 cm are 0.8 to 1.4 rows of disparity at 1.2 to 1.8 m."""
-    near, far = int(VIEW.at_1m / 1.2), int(VIEW.at_1m / 1.8)
-    level, step = (evidence(VIEW, stains, striped, drop).level[:, far:near] for drop in (0.0, drop_m))
+    level, step = (evidence(VIEW, stains, striped, drop).levels[:, between(1.2, 1.8)] for drop in (0.0, drop_m))
     assert (level.mean(axis=2) > 1).all() and (step[others].mean(axis=1) < -1).all()
 
 
 def test_a_floor_that_repeats_itself_and_falls_deep_is_no_floor_where_its_period_fits() -> None:
     """Ribs of 11 cm that lie 0.5 m lower fit as the floor does 1 to 1.25 m away; 1.3 m and farther they do not."""
     found = evidence(VIEW, ribbed, striped, 0.5)
-    fits = slice(int(VIEW.at_1m / 1.25), int(VIEW.at_1m / 1.0))
-    farther = slice(int(VIEW.at_1m / 1.6), int(VIEW.at_1m / 1.3))
+    fits, farther = between(1.0, 1.25), between(1.3, 1.6)
     assert np.nanmean(found.floor[fits]) > 1
-    assert found.level[1, fits].mean() < 1.5 and found.level[1, farther].mean() < -10
+    assert found.levels[1, fits].mean() < 1.5 and found.levels[1, farther].mean() < -10
 
 
 def test_floor_nearer_than_a_scan_that_no_direction_shows_is_not_used() -> None:
     """Who crosses it would be out of view on the way to the base; not so below hidden rows, or beside a speck."""
     shown = np.stack([VISIBLE] * 4)
     shown[1, 160:175] = shown[2, 78:96] = shown[3, 160:175, 100:400] = False  # 1.4 to 1.7 m away, the horizon, a speck
-    floors = [evidence(made(visible), stains, striped).floor.any(axis=1) for visible in shown]
-    floors_m = [VIEW.at_1m / np.flatnonzero(floor).max() for floor in floors]
+    floors_m = [made(visible).bins.ends_m[0] for visible in shown]
     assert floors_m[0] < 1.1 and floors_m[1] > 1.7 and floors_m[2:] == pytest.approx(2 * floors_m[:1])
 
 
@@ -94,7 +97,7 @@ def test_a_floor_in_jpegs_is_no_evidence_against_itself() -> None:
 
 def _floor(lower: PaddedPanorama, upper: PaddedPanorama) -> NDArray[np.float32]:
     """Return the evidence of the floor from 1 to 2.5 m."""
-    return seen(VIEW, (lower, upper)).floor[round(VIEW.at_1m / 2.5) : round(VIEW.at_1m / 1.0)]
+    return seen(VIEW, (lower, upper)).floor[between(1.0, 2.5)]
 
 
 def _coded(panorama: PaddedPanorama, known: bool = True) -> PaddedPanorama:
