@@ -73,91 +73,71 @@ VIEWS: Final = 3.0  # Pairs that count: nearer ones show a ramp better.
 
 
 class Ramp(NamedTuple):
-    """The floor beyond a line across a way, about the viewpoint of a pair."""
+    """The floor beyond a line across a way, in odom."""
 
-    start_m: float  # of the line, along the way; below 0: behind
+    way_rad: float  # azimuth of the way
+    offset_m: float  # of the line along the way
     slope: float  # along the way, against the floor before the line
-    way_rad: float  # azimuth of the way in the rectified frame
+    nats: float  # evidence of it, by all pairs
 
-    def plane(self, floor: FloorPlane) -> FloorPlane:
-        """Return the plane of the ramp, which begins on a floor."""
-        a, b = floor.a + self.slope * math.cos(self.way_rad), floor.b + self.slope * math.sin(self.way_rad)
-        return FloorPlane(floor.height_m + self.slope * self.start_m, a, b)
+    def start_m(self, viewpoint: Array) -> float:
+        """Return how far the line is from a viewpoint (x, y, heading) along the way; below 0: behind."""
+        return self.offset_m - _along(viewpoint, self.way_rad)
 
-    def begins_before(self, ranges_m: Array) -> Flags:
-        """Return whether places at ranges (N,) are beyond the line (N, DIRECTIONS)."""
-        return np.asarray(np.outer(ranges_m, np.cos(AZIMUTHS - self.way_rad)) > self.start_m)
+    def joined(self, found: Ramp) -> Ramp:
+        """Return the mean with what a pair shows, weighted by the evidence; or that, where it is another ramp."""
+        is_same = abs(found.offset_m - self.offset_m) < SAME_M and abs(found.slope - self.slope) < SAME
+        if not is_same or math.cos(found.way_rad - self.way_rad) < math.cos(HALF_RAD):
+            return found
+        nats = min(self.nats, (VIEWS - 1) * found.nats) + found.nats
+        share = found.nats / nats
+        offset_m = self.offset_m + share * (found.offset_m - self.offset_m)
+        return Ramp(self.way_rad, offset_m, self.slope + share * (found.slope - self.slope), nats)
 
 
-class Ramps:
-    """The ramp before a base, or that which it drives onto, by all pairs."""
+def _along(viewpoint: Array, way_rad: float) -> float:
+    """Return how far a place is along a way in odom [m]."""
+    return float(viewpoint[0] * math.cos(way_rad) + viewpoint[1] * math.sin(way_rad))
 
-    def __init__(self) -> None:
-        self.way_rad, self.offset_m = 0.0, 0.0  # azimuth of the way in odom, and offset of the line along it
-        self._slope, self._nats = 0.0, 0.0  # and evidence by all pairs; 0: no ramp is known
 
-    def forget(self) -> None:
-        """Forget the ramp that is known."""
-        self._nats = 0.0
+def ramp_ahead(pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: float, climbed: float) -> Ramp | None:
+    """Search for a ramp ahead in a pair on the floor before it.
 
-    def seen_from(self, viewpoint: Array, turn_rad: float) -> Ramp | None:
-        """Return the ramp that is known, from a viewpoint (x, y, heading) in odom; turn_rad: of odom in the rectified
-        frame."""
-        if not self._nats:
-            return None
-        return Ramp(self.offset_m - self._along(viewpoint, self.way_rad), self._slope, self.way_rad + turn_rad)
+    viewpoint: x, y, heading in odom; turn_rad: of odom in the rectified frame; climbed: slope of the base in odom.
+    """
+    # 1. Gains of all ramps in parts of the way.
+    aside = np.angle(np.exp(1j * (AZIMUTHS - viewpoint[2] - turn_rad)))
+    order = np.argsort(aside)
+    ahead = order[np.abs(aside[order]) < HALF_RAD]
+    parts = ahead[: len(ahead) // PARTS * PARTS].reshape(PARTS, -1)[:, ::2].astype(np.int32)
+    slopes = np.concatenate([np.arange(GENTLEST, STEEPEST + STEP / 2, STEP), TOO_STEEP])
+    if climbed > GENTLEST:  # A landing is level.
+        slopes = np.append(slopes, STEP * np.arange(-2, 3) - climbed)
+    gains = np.empty((PARTS, len(STARTS_M), len(slopes)))
+    upright = np.empty((PARTS, math.ceil(view.at_1m / STARTS_M[0]), view.height))
+    live, height_m = pair.seen * np.uint8(255), view.plane.height_m
+    images = *pair.normalised(BOUNDED_SIGMAS), live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
+    geometry = view.row0, FOCAL_PX, height_m, view.at_1m / FOCAL_PX, SEEN_M
+    ramp_gains(*images, *geometry, STARTS_M, slopes, gains, upright)
+    # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
+    sums = np.pad(np.cumsum(upright, axis=2), ((0, 0), (0, 0), (1, 0)))
+    below_m = height_m + np.outer(STARTS_M, slopes)
+    far = np.ceil(view.row0 + FOCAL_PX * (below_m / SEEN_M - slopes)).astype(int)
+    near = np.floor(view.row0 + FOCAL_PX * height_m / STARTS_M).astype(int)[:, None]
+    ends = (np.clip(rows, int(view.row0), view.height) for rows in (near + 1, far))
+    things = np.subtract(*(sums[:, :, rows] for rows in ends)).max(axis=1)
+    # 3. The likeliest, which most parts show. Every second direction was looked at.
+    nats = 2 * RATIO / UNITS * PARTS * np.median(gains - np.maximum(things, 0), axis=0)
+    x, s = np.unravel_index(nats.argmax(), nats.shape)
+    if nats[x, s] < LEAST_NATS or slopes[s] >= TOO_STEEP[0]:
+        return None
+    way_rad = float(viewpoint[2])
+    return Ramp(way_rad, float(STARTS_M[x]) + _along(viewpoint, way_rad), float(slopes[s]), float(nats[x, s]))
 
-    def search(self, pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: float, climbed: float) -> bool:
-        """Search for a ramp ahead in a pair on the floor before it; return whether it is a new one.
 
-        viewpoint: x, y, heading in odom; turn_rad: of odom in the rectified frame; climbed: slope of the base in odom.
-        """
-        # 1. Gains of all ramps in parts of the way.
-        aside = np.angle(np.exp(1j * (AZIMUTHS - viewpoint[2] - turn_rad)))
-        order = np.argsort(aside)
-        ahead = order[np.abs(aside[order]) < HALF_RAD]
-        parts = ahead[: len(ahead) // PARTS * PARTS].reshape(PARTS, -1)[:, ::2].astype(np.int32)
-        slopes = np.append(np.arange(GENTLEST, STEEPEST + STEP / 2, STEP), TOO_STEEP)
-        if climbed > GENTLEST:  # A landing is level.
-            slopes = np.append(slopes, STEP * np.arange(-2, 3) - climbed)
-        ramps = np.empty((PARTS, len(STARTS_M), len(slopes)))
-        upright = np.empty((PARTS, math.ceil(view.at_1m / STARTS_M[0]), view.height))
-        live, height_m = pair.seen * np.uint8(255), view.plane.height_m
-        images = *pair.normalised(BOUNDED_SIGMAS), live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
-        geometry = view.row0, FOCAL_PX, height_m, view.at_1m / FOCAL_PX, SEEN_M
-        ramp_gains(*images, *geometry, STARTS_M, slopes, ramps, upright)
-        # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
-        sums = np.pad(np.cumsum(upright, axis=2), ((0, 0), (0, 0), (1, 0)))
-        below_m = height_m + np.outer(STARTS_M, slopes)
-        far = np.ceil(view.row0 + FOCAL_PX * (below_m / SEEN_M - slopes)).astype(int)
-        near = np.floor(view.row0 + FOCAL_PX * height_m / STARTS_M).astype(int)[:, None]
-        ends = (np.clip(rows, int(view.row0), view.height) for rows in (near + 1, far))
-        things = np.subtract(*(sums[:, :, rows] for rows in ends)).max(axis=1)
-        # 3. The likeliest, which most parts show. Every second direction was looked at.
-        nats = 2 * RATIO / UNITS * PARTS * np.median(ramps - np.maximum(things, 0), axis=0)
-        x, s = np.unravel_index(nats.argmax(), nats.shape)
-        if nats[x, s] < LEAST_NATS or slopes[s] >= TOO_STEEP[0]:
-            return False
-        offset_m = float(STARTS_M[x]) + self._along(viewpoint, viewpoint[2])
-        return self._add(float(viewpoint[2]), offset_m, float(slopes[s]), float(nats[x, s]))
-
-    def _add(self, way_rad: float, offset_m: float, slope: float, nats: float) -> bool:
-        """Take what a pair shows into the mean of those that showed the same ramp, weighted by their evidence; return
-        whether it is a new one."""
-        is_same = abs(offset_m - self.offset_m) < SAME_M and abs(slope - self._slope) < SAME
-        if not self._nats or not is_same or math.cos(way_rad - self.way_rad) < math.cos(HALF_RAD):
-            self.way_rad, self.offset_m, self._slope, self._nats = way_rad, offset_m, slope, nats
-            return True
-        self._nats = min(self._nats, (VIEWS - 1) * nats) + nats
-        share = nats / self._nats
-        self.offset_m += share * (offset_m - self.offset_m)
-        self._slope += share * (slope - self._slope)
-        return False
-
-    @staticmethod
-    def _along(place: Array, way_rad: float) -> float:
-        """Return how far a place is along a way in odom [m]."""
-        return float(place[0] * math.cos(way_rad) + place[1] * math.sin(way_rad))
+def _is_beyond(start_m: float, way_rad: float, ranges_m: Array) -> Flags:
+    """Return whether places at ranges (N,) are beyond a line across a way (N, DIRECTIONS), in the rectified frame."""
+    return np.asarray(np.outer(ranges_m, np.cos(AZIMUTHS - way_rad)) > start_m)
 
 
 class RayScans:
@@ -170,7 +150,7 @@ class RayScans:
         self._tilt, self._P, self._used = np.zeros(2), PRIOR_RAD**2 * np.eye(2), np.zeros(2)
         self._bins: Bins | None = None
         self._followed_ns: int | None = None  # stamp of the last pair by which tilt and ramps were followed
-        self._ramps = Ramps()
+        self._ramp: Ramp | None = None
         self._way = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
         self.belief: RayBelief | None = None  # of the newest pair
 
@@ -179,15 +159,15 @@ class RayScans:
         self._T_rect_base, self._visible = T_rect_base, visible
         self._T_odom_floor = np.eye(4)  # pose of the base when it stood on the floor before a ramp
         self.grid.set_floor(T_rect_base)
-        self._ramps.forget()
+        self._ramp = None
         self._bins = None
-        self._floor = self._ramp = self._view(floor_plane(T_rect_base))
+        self._floor = self._on_ramp = self._view(floor_plane(T_rect_base))
         self._bins = self._floor.bins
 
     def begin_again(self) -> None:
         """Forget what is known in odom, as the way since then is not."""
         self.grid.begin_again()
-        self._ramps.forget()
+        self._ramp = None
 
     def add(
         self, stamp_ns: int, T_odom_base: Array, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None
@@ -200,11 +180,10 @@ class RayScans:
         viewpoint = planar(self.grid.viewpoint(pose))
         turn_rad = math.atan2(self._T_rect_base[1, 0], self._T_rect_base[0, 0]) - viewpoint[2]
         # 1. The plane of the floor, and that of a ramp.
-        ramp = self._ramps.seen_from(viewpoint, turn_rad)
-        if ramp is not None and ramp.start_m < -HALF_BASE_M:
-            self._ramps.forget()
-            ramp = None
-        stands_level = ramp is None or ramp.start_m > HALF_BASE_M
+        start_m = math.inf if self._ramp is None else self._ramp.start_m(viewpoint)
+        if start_m < -HALF_BASE_M:
+            self._ramp, start_m = None, math.inf
+        ramp, stands_level = self._ramp, start_m > HALF_BASE_M
         if stands_level:
             self._T_odom_floor = T_odom_base
         floor = floor_plane(self._T_rect_base @ se3.inverse(T_odom_base) @ self._T_odom_floor)
@@ -215,10 +194,13 @@ class RayScans:
         # 2. What the pair shows on them.
         pair = self._floor.pair(lower, upper, lost)
         shown = self._floor.shown(pair)
+        way_rad = 0.0
         if ramp is not None:
-            self._ramp = self._seen(ramp.plane(floor), self._ramp)
-            on_ramp = self._ramp.shown(self._ramp.pair(lower, upper, lost))
-            shown = shown.beyond(ramp.begins_before(self._floor.bins.ranges_m), on_ramp)
+            way_rad = ramp.way_rad + turn_rad
+            a, b = floor.a + ramp.slope * math.cos(way_rad), floor.b + ramp.slope * math.sin(way_rad)
+            self._on_ramp = self._seen(FloorPlane(floor.height_m + ramp.slope * start_m, a, b), self._on_ramp)
+            on_ramp = self._on_ramp.shown(self._on_ramp.pair(lower, upper, lost))
+            shown = shown.beyond(_is_beyond(start_m, way_rad, self._floor.bins.ranges_m), on_ramp)
         # 3. The belief, with the look of floor that is known, and the grid.
         known = self.grid.is_floor(pose, self._floor.bins.ranges_m)
         self.belief = ray_belief(shown, self._floor.bins, pair.sensor_grey, known)
@@ -226,25 +208,30 @@ class RayScans:
         # 4. Tilt and ramps, for the next pair.
         is_due = self._followed_ns is None or not 0 <= stamp_ns - self._followed_ns < FOLLOWED_NS
         if stands_level and (is_due or np.diag(self._P).max() > SURE_RAD**2):
-            self._observe_tilt(pose, pair, ramp)
+            self._observe_tilt(pose, pair, start_m, way_rad)
         if is_due:
             self._followed_ns = stamp_ns
         # A rig that leans shows a slope everywhere.
-        is_due = is_due and np.diag(self._P).max() < SURE_RAD**2 and (ramp is None or ramp.start_m > FOUND_M)
-        if is_due and self._ramps.search(pair, self._floor, viewpoint, turn_rad, float(T_odom_base[2, 0])):
-            # What was seen beyond its start was compared with another floor.
-            self.grid.forget_beyond(self._ramps.way_rad, self._ramps.offset_m)
+        if is_due and np.diag(self._P).max() < SURE_RAD**2 and start_m > FOUND_M:
+            found = ramp_ahead(pair, self._floor, viewpoint, turn_rad, float(T_odom_base[2, 0]))
+            if found is not None:
+                self._ramp = found if ramp is None else ramp.joined(found)
+            if found is not None and self._ramp is found:
+                # What was seen beyond its start was compared with another floor.
+                self.grid.forget_beyond(found.way_rad, found.offset_m)
         return scan
 
-    def _observe_tilt(self, pose: Array, pair: WorkingPair, ramp: Ramp | None) -> None:
-        """Take a pair into the filter of the tilt, by near floor that is known; pose (4, 4): of the base, planar."""
+    def _observe_tilt(self, pose: Array, pair: WorkingPair, start_m: float, way_rad: float) -> None:
+        """Take a pair into the filter of the tilt, by near floor that is known, before a ramp that begins along a way.
+
+        pose (4, 4): of the base, planar.
+        """
         self._P = self._P + DRIFT_RAD**2 * np.eye(2)
         view, height_m = self._floor, self._floor.plane.height_m
         ranges_m = FOCAL_PX * height_m / np.maximum(np.arange(view.height) - view.row0, 1e-6)
         rows = np.flatnonzero((ranges_m < LEAN_M) & (view.plane_rows < view.last_row - 2))
         known = self.grid.is_floor(pose, ranges_m[rows]) & pair.seen[rows]
-        if ramp is not None:
-            known &= ~ramp.begins_before(ranges_m[rows])
+        known &= ~_is_beyond(start_m, way_rad, ranges_m[rows])
         if not known.any():
             return
         # 1. Difference and gradient of both views on the plane.
