@@ -28,6 +28,7 @@ from omnid.config import FIRST_SETTINGS
 from omnid.doctor import checks
 from omnid.doctor.wheel_wiring import tested_drive
 from omnid.errors import OmnidError
+from omnid.light.exposure import USUAL_HZ
 from omnid.monitor.listen import listen as listen_to
 from omnid.service import install
 from omnid.settings import dump
@@ -124,7 +125,6 @@ def require_packages() -> None:
 
 ROOT = Path("/")  # folder of sys, dev and proc
 BYTES_PER_PIXEL = 0.2  # of a JPEG of quality 90 from below a mirror
-USUAL_HZ = 30.0  # rate of cameras that keep their own
 
 
 @command(SETTINGS)

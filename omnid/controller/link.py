@@ -182,7 +182,8 @@ class ControllerLink:
         try:
             first = self._channel.receive(start_s)
         except EOFError:
-            raise OmnidError(self._unexpected_end()) from None
+            self._require_asked_end()
+            return
         if first is NO_MESSAGE:
             raise OmnidError(f"the controller process did not start within {start_s:.0f} s: is the host overloaded?")
         if isinstance(first, StartFailed):
@@ -191,14 +192,13 @@ class ControllerLink:
             self._report(first.text)
 
     def _require_asked_end(self) -> None:
+        """Note that no more reports come; OmnidError where the process was not asked to end."""
         self.statistics.close()
-        if not self._ended_ns:
-            raise OmnidError(self._unexpected_end())
-
-    def _unexpected_end(self) -> str:
+        if self._ended_ns:
+            return
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
-        return (
+        raise OmnidError(
             f"the controller process has ended unexpectedly, with exit code {self._process.returncode}; the motor "
             "controller's own watchdog stops the wheels: start omnid again"
         )

@@ -25,7 +25,7 @@ from drivers.cameras.camera_state import (
 )
 from drivers.frame import Camera
 from omnid.config import CamerasConfig
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import FramePair
 
 SAMPLED_COLUMNS: Final = 160  # of the panorama: some thousand samples
@@ -34,6 +34,7 @@ TARGET, SATURATED = 100.0, 250.0  # grey levels: the mean that is regulated to, 
 # largest step. A saturated area is assumed to be too bright by this factor, by which bright spots may lower the mean.
 BAND: Final = math.sqrt(2)
 STEP_S: Final = 0.5  # between two steps: images show a step only some frames later
+USUAL_HZ: Final = 30.0  # rate of cameras that keep their own
 
 
 class GreyLevels(NamedTuple):
@@ -141,8 +142,7 @@ class ExposureControl:
     def __init__(self, area: UsefulArea, config: CamerasConfig, cameras: Mapping[Camera, CameraState]) -> None:
         self._area, self._config = area, config
         self._exposures = [state.exposure for state in cameras.values() if state.exposure is not None]
-        self._last_ns = -math.inf  # the pair before
-        self._period_ns = math.inf  # least time between two pairs
+        self._period_ns = NS_PER_S / (config.rate_hz or USUAL_HZ)
         self._law: ExposureLaw | None = None
         self._levels: tuple[GreyLevels, GreyLevels] | None = None  # of the newest measured pair
         self._next_ns: float = -math.inf
@@ -159,8 +159,7 @@ class ExposureControl:
 
     def process(self, pair: FramePair) -> None:
         """Measure a pair if it is due, and make a request where the law takes a step."""
-        self._period_ns, self._last_ns = min(self._period_ns, pair.stamp_ns - self._last_ns), pair.stamp_ns
-        if pair.stamp_ns < self._next_ns or self._period_ns == math.inf:
+        if pair.stamp_ns < self._next_ns:
             return
         self._next_ns = pair.stamp_ns + STEP_S / S_PER_NS
         self._levels = self._area.levels(pair)
