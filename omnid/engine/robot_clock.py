@@ -40,7 +40,7 @@ class RobotClock:
         self._following = Lock()
         # Stamps from which on an offset is in force [ns], with the offset.
         self._offsets = deque[tuple[float, int]]([(-math.inf, self._measured()[1])], KEPT)
-        self.steps, self._step_at_ns, self._words = 0, 0, "followed"
+        self.steps, self._step_at_ns, self._step_s = 0, 0, math.nan
 
     def follow(self) -> None:
         """Measure the offset, follow it, and report a step; without a step at most once a second."""
@@ -54,7 +54,7 @@ class RobotClock:
             if not is_step:
                 return
             how = f"was set {'forwards' if change_ns > 0 else 'back'} by {abs(change_ns) * S_PER_NS:.3f} s"
-            self.steps, self._step_at_ns, self._words = self.steps + 1, now_ns, f"it {how}: the stamps follow it"
+            self.steps, self._step_at_ns, self._step_s = self.steps + 1, now_ns, change_ns * S_PER_NS
         self._report(f"the computer's clock {how}: stamps follow it, a recording goes on in a new file")
 
     def _measured(self) -> tuple[int, int, int]:
@@ -99,9 +99,9 @@ class RobotClock:
         return self.monotonic_ns() - self.stamp_ns(unix_ns)
 
     def stats(self) -> dict[str, object]:
-        """Return the number of steps, and the newest one in words."""
+        """Return the number of steps, and the newest one."""
         self.follow()
-        return {"steps": self.steps, "_words": self._words}
+        return {"steps": self.steps, "step_s": self._step_s}
 
 
 def log_time() -> RobotClock:

@@ -181,19 +181,15 @@ class ExposureControl:
 
     def stats(self) -> dict[str, object]:
         """Return exposure, gain and grey levels, and whether it is too dark or too bright."""
-        if self._levels is None:
-            return {"_words": "no images yet"}
-        stats: dict[str, object] = dict(
-            zip(("lower_grey", "upper_grey"), (round(one.mean) for one in self._levels), strict=True)
-        )
-        if self._law is None or self._left_to_cameras:
-            return stats | {"_words": self._left_to_cameras}
-        state, setting = self._law.state, self._law.setting
-        gain = "" if setting.gain is None else setting.gain
-        stats |= {"exposure_ms": setting.exposure_us * 1e-3, "steps": self._law.steps, "gain": gain}
-        if state == "regulated":
-            return stats | {"_words": state}
-        return stats | {"_warning": f"{state}: exposure time and gain are at their limits"}
+        stats: dict[str, object] = {"state": self._left_to_cameras or "no images yet"}
+        if self._levels is not None:
+            stats |= zip(("lower_grey", "upper_grey"), (round(one.mean) for one in self._levels), strict=True)
+        if self._law is not None and not self._left_to_cameras:
+            setting = self._law.setting
+            gain = "" if setting.gain is None else setting.gain
+            stats |= {"state": self._law.state, "steps": self._law.steps, "gain": gain}
+            stats["exposure_ms"] = setting.exposure_us * 1e-3
+        return stats
 
     def _request(self, setting: ExposureSetting | None, stamp_ns: int) -> None:
         """Ask both cameras for a setting; None: they regulate themselves."""

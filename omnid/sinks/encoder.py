@@ -14,7 +14,6 @@ from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, PoseAttachment
@@ -160,17 +159,11 @@ def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0, run: str = "") -
 
 def navigation_stats(update: NavigationUpdate) -> Stats:
     """Return the numbers of an update, for its own topic: see NavigationReport."""
-    severity = "_words"
-    if update.state in (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED):
-        severity = "_warning"
-    elif update.state == NavigationState.FAILED:
-        severity = "_error"
     names = ("state", "task", "reason", "left_m", "offset_m")
     stats: dict[str, object] = {name: getattr(update, name) for name in names}
     stats |= {
         "command_ns": update.command_ns or "",
         "loops_left": update.loops_left if update.loops_left > 1 else "",
-        severity: f"{update.state}: {update.reason}" if update.reason else update.state,
     }
     if update.teaching:
         stats |= {"teaching": update.teaching, "taught_m": update.taught_m}

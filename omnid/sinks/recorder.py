@@ -117,7 +117,7 @@ class Recorder:
         """Return the state of the files, with counts of all that was lost after the inbox."""
         state, names = self.state, ("file", "messages", "lost", "files", "deleted")
         counts = {name: getattr(state, name) for name in names} | {"invalid": self.invalid}
-        return {**counts, "_error" if state.status == "stopped" else "_words": state.problem or state.status}
+        return {**counts, "state": state.status, "problem": state.problem}
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""

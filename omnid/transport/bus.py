@@ -27,6 +27,7 @@ from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.session import ALIVE, PERIOD_S, BusConfig, has_receiver, open_session, reason
+from omnid.transport.status_names import SAME_NAME
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import (
     ARM,
@@ -158,15 +159,11 @@ class Bus:
         """Return whether the name is unique, and how often others sent too much."""
         rings = [*self._rings, *self._queries.values()]
         before, self._flooded = self._flooded, sum(ring.floods for ring in rings)
-        warning = ""
-        if self._flooded > before:
-            warning = f"more messages on {max(rings, key=attrgetter('floods')).key} than are taken: end their sender"
+        most = max(rings, key=attrgetter("floods"), default=None)
         return {
             "same_name": len(self._namesakes),  # other robots of this name
             "floods": self._flooded,  # how often a key had more messages than its budget
-            "_error": "" if self.is_unique else self._same_name,
-            "_warning": warning,
-            "_words": "open",
+            "flooded": most.key if most and self._flooded > before else "",
         }
 
     @property
@@ -247,13 +244,6 @@ class Bus:
         with suppress(zenoh.ZError):  # raised for such a subscriber; nothing of ours is lost
             self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 
-    @property
-    def _same_name(self) -> str:
-        return (
-            f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands: this "
-            "one is not armed before the other has gone; change bus.robot of one of them"
-        )
-
     def _watch_for_namesakes(self) -> None:
         """Declare the name, and watch for others: they keep this robot from being armed, never from starting."""
         own = f"{self._config.robot}/{ALIVE}/{self._session.zid()}"
@@ -265,7 +255,7 @@ class Bus:
             elif key != own:
                 self._namesakes.add(key)
                 if was_unique:
-                    self._warn(self._same_name)
+                    self._warn(SAME_NAME)
                     # Two robots that obey one operator are not what the operator expects.
                     self._on_command(Request(STOP))
 

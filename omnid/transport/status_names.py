@@ -1,16 +1,16 @@
 """The entries of `<robot>/status`: names, keys, how severe what a part reports is, and what to do.
 
-A part of the robot gives its numbers (`stats()`), with units in their keys, and says in words what is wrong: by the key
-_error, _stale or _warning, which gives the severity, or else _words. Every number is a value of its own, written as a
-decimal number. Messages are for people: programs do not parse them, and they hold no number that changes from one
-report to the next. Keys that begin with "_" are not published.
+A part of the robot gives its numbers and states (`stats()`), with units in their keys; WORDS says what they mean. A
+part that is not in WORDS gives words by the key _error, _stale or _warning, which is the severity, or else _words.
+Every number is a value of its own, written as a decimal number. Messages are for people: programs do not parse them,
+and they hold no number that changes from one report to the next. Keys that begin with "_" are not published.
 """
 
 from __future__ import annotations
 
 import math
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final, TypeAlias
@@ -20,6 +20,7 @@ import msgspec
 from omnid.core.control.safety_rules import ASKED
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
+from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, decode_diagnostics
 
@@ -54,6 +55,10 @@ TIMEOUT_S: Final = 1.0  # An older image of a camera, or an older pose, is repor
 # Share of the pairs that were dark, had lost parts, no sure pose or no place in a queue, from which there is a warning.
 NOTABLE_SHARE: Final = 0.1
 LIVE: Final = "all parts are live"  # of the images
+SAME_NAME: Final = (
+    "another robot on the bus has this one's name, and both obey the same commands: this one is not armed before the "
+    "other has gone; change bus.robot of one of them"
+)
 
 
 class Key(StrEnum):
@@ -102,6 +107,41 @@ TICK_LATE: Final = "tick_late"
 Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys, and words
 SAYS: Final = {"_error": ERROR, "_stale": STALE, "_warning": WARN, "_words": OK}  # severity of words by their key
 
+HINDERED: Final = (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED)
+
+
+def state_and_reason(stats: Stats) -> str:
+    """Return a state in words."""
+    return f"{stats['state']}: {stats['reason']}" if stats["reason"] else str(stats["state"])
+
+
+# What the numbers of a part mean: the first words that are not empty, and their severity.
+WORDS: Final[Mapping[str, Mapping[int, Callable[[Stats], object]]]] = {
+    NAVIGATION: {
+        ERROR: lambda stats: stats["state"] == NavigationState.FAILED and state_and_reason(stats),
+        WARN: lambda stats: stats["state"] in HINDERED and state_and_reason(stats),
+        OK: state_and_reason,
+    },
+    BUS: {
+        ERROR: lambda stats: stats["same_name"] and SAME_NAME,
+        WARN: lambda stats: (
+            stats["flooded"] and f"more messages on {stats['flooded']} than are taken: end their sender"
+        ),
+        OK: lambda _: "open",
+    },
+    CLOCK: {OK: lambda stats: f"set by {stats['step_s']:+.3f} s: the stamps follow" if stats["steps"] else "followed"},
+    RECORDING: {
+        ERROR: lambda stats: stats["state"] == "stopped" and stats["problem"],
+        OK: lambda stats: stats["problem"] or stats["state"],
+    },
+    EXPOSURE: {
+        WARN: lambda stats: (
+            stats["state"].startswith("too ") and f"{stats['state']}: exposure time and gain are at their limits"
+        ),
+        OK: lambda stats: stats["state"],
+    },
+}
+
 # What to do where a part is not well and gives no advice of its own.
 REMEDIES: Final[Mapping[str, str]] = {
     ODOMETRY: "stop, then drive back slowly to a place that it has seen; check light and mirrors",
@@ -125,13 +165,14 @@ REMEDIES: Final[Mapping[str, str]] = {
 def entry(name: str, stats: Stats) -> DiagnosticStatus:
     """Return the entry of a part: its numbers, and level, words and advice; a part with a state alone reports that."""
     state = str(stats.get(Key.STATE, ""))
-    said = ((level, str(stats[key])) for key, level in SAYS.items() if stats.get(key))
-    level, words = next(said, (ERROR if state == MapState.LOST else OK, state))
+    said = [(level, str(stats[key])) for key, level in SAYS.items() if stats.get(key)]
+    said += [(level, str(text)) for level, words in WORDS.get(name, {}).items() if (text := words(stats))]
+    level, message = said[0] if said else (ERROR if state == MapState.LOST else OK, state)
     values = {key: value for key, value in stats.items() if not key.startswith("_")}
     remedy = REMEDIES.get(CAMERAS if name.endswith(" camera") else name)
     if level != OK and remedy and not values.get(Key.REMEDY):
         values[Key.REMEDY] = remedy
-    return DiagnosticStatus.of(name, level, words, values)
+    return DiagnosticStatus.of(name, level, message, values)
 
 
 def by_reason(prefix: str, counts: Mapping[str, int]) -> dict[str, int]:
