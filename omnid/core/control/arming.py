@@ -141,8 +141,11 @@ class Arming:
         # 2. The newest request is answered, and arms where nothing refuses it.
         request, self._request = self._request, None
         if request is not None:
-            self.answer = ArmAnswer(request.id, self._refusal(request, fault, now_ns, longest_s))
-            if not self.answer.refusal:
+            refusal = fault or (OLDER_THAN_STOP if request.arrival_ns <= self._stop_ns else "")
+            if not refusal and not 0 <= now_ns - request.arrival_ns <= longest_s * 1e9:
+                refusal = TOO_LATE
+            self.answer = ArmAnswer(request.id, refusal)
+            if not refusal:
                 self._released_ns, self._touched = request.arrival_ns, False
                 self.armed, self.reason = True, ""
                 return request
@@ -150,13 +153,3 @@ class Arming:
         if self._automatic and not fault and not self.stop_asked and not self._touched:
             self.armed, self.reason = True, ""
         return None
-
-    def _refusal(self, request: ArmRequest, fault: str, now_ns: int, longest_s: float) -> str:
-        """Return why a request is refused, empty where it is accepted."""
-        if fault:
-            return fault
-        if request.arrival_ns <= self._stop_ns:
-            return OLDER_THAN_STOP
-        if not 0 <= now_ns - request.arrival_ns <= longest_s * 1e9:
-            return TOO_LATE
-        return ""

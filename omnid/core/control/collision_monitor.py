@@ -168,33 +168,6 @@ class Outline(NamedTuple):
         return any(edge_m - way_m <= side * x < edge_m and abs(y) <= self.half_width_m for x, y in now)
 
 
-class DrivenWay:
-    """Where the base was at the newest ticks, from each of which on it followed a motion."""
-
-    def __init__(self, longest_s: float) -> None:
-        """longest_s: time that is remembered."""
-        self._longest_ns = longest_s / S_PER_NS
-        self._ticks: deque[tuple[int, Twist, Pose2]] = deque()
-
-    def add(self, now_ns: int, motion: Twist) -> None:
-        """Take the motion that the base follows from now on."""
-        self._ticks.append((now_ns, motion, self._at(now_ns)))
-        while len(self._ticks) > 1 and self._ticks[1][0] < now_ns - self._longest_ns:
-            self._ticks.popleft()
-
-    def since(self, stamp_ns: int, now_ns: int) -> Pose2:
-        """Return the pose of the base now, in its own frame at a stamp."""
-        return relative(self._at(min(stamp_ns, now_ns)), self._at(now_ns))
-
-    def _at(self, stamp_ns: int) -> Pose2:
-        """Return the pose at a time, where it stood before the first motion."""
-        if not self._ticks:
-            return IDENTITY
-        at_ns, motion, pose = next((tick for tick in reversed(self._ticks) if tick[0] <= stamp_ns), self._ticks[0])
-        passed_s = max(stamp_ns - at_ns, 0) * S_PER_NS
-        return composed(pose, along_arc(motion.velocity_mps, motion.yaw_rate_radps, passed_s))
-
-
 # Floor that is seen so far is open; a scan may end nearer than that, and nothing is known beyond.
 FAR_M: Final = 5.0
 UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
@@ -294,7 +267,8 @@ class CollisionMonitor:
         self._kinds: tuple[Kind, ...] = ()  # what the newest scan shows
         self._is_blind = False  # its images show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
-        self._way = DrivenWay(settings.stale_s)
+        # Time, pose, and the motion that the base followed from then on, of the newest ticks.
+        self._ticks: deque[tuple[int, Twist, Pose2]] = deque()
         self.reason = ""  # why the last step changed the motion
         self.holds = False  # the motion was stopped, or could only creep
         self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
@@ -348,7 +322,17 @@ class CollisionMonitor:
 
     def follow(self, now_ns: int, motion: Twist) -> None:
         """Take the motion that the base follows from now on."""
-        self._way.add(now_ns, motion)
+        self._ticks.append((now_ns, motion, self._pose_at(now_ns)))
+        while len(self._ticks) > 1 and self._ticks[1][0] < now_ns - self._settings.stale_s / S_PER_NS:
+            self._ticks.popleft()
+
+    def _pose_at(self, stamp_ns: int) -> Pose2:
+        """Return the pose of the base at a time; before the first motion it stood."""
+        if not self._ticks:
+            return IDENTITY
+        at_ns, motion, pose = next((tick for tick in reversed(self._ticks) if tick[0] <= stamp_ns), self._ticks[0])
+        passed_s = max(stamp_ns - at_ns, 0) * S_PER_NS
+        return composed(pose, along_arc(motion.velocity_mps, motion.yaw_rate_radps, passed_s))
 
     def _judged(self, now_ns: int, motion: Twist) -> Allowance:
         """Return the strictest allowance of all kinds of what is known."""
@@ -362,7 +346,7 @@ class CollisionMonitor:
         if self._is_blind:
             return Allowance(0.0, UNSEEN)
         # 2. What the base has driven over since the scan's images is not passed as if it were free.
-        moved = self._way.since(self._stamp_ns or now_ns, now_ns)
+        moved = relative(self._pose_at(min(self._stamp_ns or now_ns, now_ns)), self._pose_at(now_ns))
         for kind in self._kinds:
             over = is_driving and kind.policy == STOP
             if over and self._outline.driven_over(kind.points, moved, math.copysign(1.0, motion.velocity_mps)):
