@@ -26,7 +26,7 @@ from omnid.controller.ipc import (
 )
 from omnid.controller.motor import open_motor
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.process import STOP_SIGNALS, RealtimeSettings, prepare, start_thread
+from omnid.engine.process import STOP_SIGNALS, prepare, start_thread
 
 THREAD_NAME: Final = "controller"
 MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
@@ -43,7 +43,12 @@ def run_controller(channel: Channel) -> int:
         except DriverError as error:
             channel.send(StartFailed(str(error)))
             return 2
-        channel.send(LogRecord(prepare_process(start.realtime)))
+        # Memory, garbage collection and priority, for punctual ticks. What `prepare` is refused, the daemon was refused
+        # too, and logs it.
+        prepare(start.realtime)
+        refused: list[str] = []
+        start_thread({THREAD_NAME: start.realtime.motor_priority}, lambda _, line: refused.append(line), THREAD_NAME)
+        channel.send(LogRecord(" ".join(refused)))
         controller = Controller(
             driver,
             start.controller,
@@ -87,14 +92,6 @@ def receive_until_due(channel: Channel, controller: Controller) -> bool:
         elif left_s <= 0:
             return True
     return True
-
-
-def prepare_process(settings: RealtimeSettings) -> str:
-    """Set priority, memory and garbage collection for punctual ticks; return what was refused, or an empty string."""
-    prepare(settings)  # What is refused here was refused to the daemon too, which logs it.
-    refused: list[str] = []
-    start_thread({THREAD_NAME: settings.motor_priority}, lambda _, line: refused.append(line), THREAD_NAME)
-    return " ".join(refused)
 
 
 def main() -> int:
