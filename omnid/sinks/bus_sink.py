@@ -30,7 +30,6 @@ class BusSink:
         """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
         self._clock, self._time_ns = clock, 0
         self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
-        self._path_is_new = False
         self._bus, self._encode, encode.run_id = bus, encode, RUN_ID
 
     def process(self, message: Outgoing) -> None:
@@ -43,20 +42,15 @@ class BusSink:
         attachment = pose_attachment(message, time.time_ns(), RUN_ID) if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
+        # 3. The path of the base, from time to time, for those who come after a drive.
         if isinstance(message, OdometryUpdate):
-            self._publish_path(message)
-
-    def _publish_path(self, odometry: OdometryUpdate) -> None:
-        """Add a pose to the path of the base, and publish it where it has grown, for those who come after a drive."""
-        vertices = len(self._path.vertices)
-        T_base_rig = self._encode.T_base_rig
-        T_odom_base = T_base_rig @ odometry.T_odom_rig @ se3.inverse(T_base_rig)
-        self._path.add(*T_odom_base[:2, -1].tolist())
-        self._path_is_new |= len(self._path.vertices) != vertices
-        if self._path_is_new and odometry.stamp_ns >= self._path_ns + PATH_NS:
-            self._path_is_new, self._path_ns = False, odometry.stamp_ns
-            path = path_cdr(self._encode.unix_ns(odometry.stamp_ns), "odom", self._path.xy())
-            self._bus.publish("path", path)
+            T_base_rig = self._encode.T_base_rig
+            T_odom_base = T_base_rig @ message.T_odom_rig @ se3.inverse(T_base_rig)
+            self._path.add(*T_odom_base[:2, -1].tolist())
+            if message.stamp_ns >= self._path_ns + PATH_NS:
+                self._path_ns = message.stamp_ns
+                path = path_cdr(self._encode.unix_ns(message.stamp_ns), "odom", self._path.xy())
+                self._bus.publish("path", path)
 
 
 class PanoramaSink:

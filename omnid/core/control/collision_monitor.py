@@ -453,6 +453,7 @@ class CollisionMonitor:
                     continue
             gap_m = max(stop.depth_m(x, y), 0.0) - one.radius_m
             if gap_m <= 0.0:
+                # No newer scan need come within stale_s.
                 share = 0.0 if ahead_s <= settings.stale_s else ahead_s / MOVING_S
                 return min(allowance, Allowance(share, MOVING))
             if one.sigma_mps > NEW_MPS and gap_m <= math.hypot(one.sigma_m, at_s * one.sigma_mps):
