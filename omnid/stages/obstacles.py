@@ -146,9 +146,11 @@ class PairScans:
         # 3. The scan by the images, without their dead and blind parts.
         lost = tiles.lost_pixels(panoramas.visible.shape)
         scan = self.scans.add(odometry.stamp_ns, T_odom_base, panoramas.lower, panoramas.upper, lost)
+        if scan is None:
+            return unknown
         # 4. The moving obstacles.
         scan.arrivals.ranges_m[sectors_of(tiles.unknown, *of_base, (math.inf,))] = np.nan
-        viewpoint = self.scans.grid.viewpoint(transform(planar(T_odom_base)))
+        viewpoint = transform(self.scans.grid.viewpoint(planar(T_odom_base)))
         moving = self._tracker.update(odometry.stamp_ns, viewpoint, scan.arrivals)
         # 5. Nothing is said of directions in which the images show nothing to rely on.
         return replace(
@@ -167,7 +169,7 @@ class PairScans:
         Sectors are those of the rectified frame.
         """
         belief = self.scans.belief
-        return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief, self.scans.grid.risk)
+        return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief)
 
 
 class Obstacles:

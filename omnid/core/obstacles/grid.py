@@ -30,7 +30,7 @@ from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.moving_tracker import Arrivals, runs
 from omnid.core.obstacles.plane_view import AZIMUTHS, THIN_M
-from omnid.core.obstacles.posterior import RayBelief
+from omnid.core.obstacles.posterior import RISK, RayBelief
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -49,7 +49,6 @@ class GridParameters:
     most: float = 6.0
     views: float = 3.0  # n: views of a place that count
     same_place: float = 0.9  # rho: correlation of the errors of pairs from one place, 0 after the way of a cell
-    risk: float = 0.1  # probability of a thing on a way that is free
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
     strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
@@ -91,7 +90,7 @@ class FloorGrid:
     def states(self) -> Bytes:
         """State of each cell (SIDE, SIDE): OCCUPIED, FREE up to the risk of a free way, else UNKNOWN."""
         states = np.full(self.occupied.shape, UNKNOWN, np.uint8)
-        states[self.occupied <= GridParameters().risk] = FREE
+        states[self.occupied <= RISK] = FREE
         states[self.occupied > 0.5] = OCCUPIED
         return states
 
@@ -108,13 +107,7 @@ class GridScan(NamedTuple):
     sigma_m: Floats  # (SECTORS,) of the ranges
     free_m: Floats  # (SECTORS,) up to which the way is free
     arrivals: Arrivals  # of this pair, about the viewpoint
-    grid: FloorGrid | None  # None: no floor is in view
-
-
-def unknown_scan() -> GridScan:
-    """Return the scan of a pair that shows no floor."""
-    nan = np.full(SECTORS, np.nan, np.float32)
-    return GridScan(nan, nan, np.zeros(SECTORS, np.float32), Arrivals(nan, nan, np.zeros(SECTORS, bool)), None)
+    grid: FloorGrid
 
 
 class ObstacleGrid:
@@ -123,25 +116,20 @@ class ObstacleGrid:
     def __init__(self, at_1m: float, max_range_m: float) -> None:
         self._p, self._at_1m = GridParameters(), at_1m
         self._max_range_m = min(max_range_m, REACH_CELLS * CELL_M)
-        self._T_rect_base = np.eye(4)
+        self._eye_base, self._turn_rad = np.zeros(2), 0.0  # viewpoint in base axes, and angle of these to the columns'
         self._cell: NDArray[np.int64] | None = None  # of the base, in odom
         self._eye, self._near_m = np.zeros(2), 0.0  # viewpoint in cells of the grid, and the nearest floor in view
         self._forget()
 
-    @property
-    def risk(self) -> float:
-        """Probability of a thing on a way that is free."""
-        return self._p.risk
-
-    def viewpoint(self, T_odom_base: Array) -> Array:
-        """Return the pose (4, 4) of axes parallel to the base's at the viewpoint."""
-        T = np.eye(4)
-        T[:2, 3] = se3.inverse(self._T_rect_base)[:2, 3]
-        return np.asarray(T_odom_base @ T)
+    def viewpoint(self, pose: Array) -> Array:
+        """Return the viewpoint (x, y) with the heading of the base, by the pose (3,) of the base in odom."""
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        return np.append(pose[:2] + np.array([[c, -s], [s, c]]) @ self._eye_base, pose[2])
 
     def set_floor(self, T_rect_base: Array) -> None:
         """Take T_rect_base (4, 4), from the base level on the floor to the columns."""
-        self._T_rect_base = T_rect_base
+        self._eye_base = se3.inverse(T_rect_base)[:2, 3]
+        self._turn_rad = math.atan2(T_rect_base[1, 0], T_rect_base[0, 0])
 
     def begin_again(self) -> None:
         """Forget what is known, as the way since then is not, but for things nearer than the floor in view.
@@ -173,18 +161,18 @@ class ObstacleGrid:
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
 
-    def update(self, stamp_ns: int, T_odom_base: Array, belief: RayBelief) -> GridScan:
-        """Add a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
-        p, place_m, yaw = self._p, T_odom_base[:2, 3].copy(), float(se3.yaw(T_odom_base))
+    def update(self, stamp_ns: int, pose: Array, belief: RayBelief) -> GridScan:
+        """Add a pair, whose base has the pose (3,) in odom; return what is known."""
+        p, place_m, yaw = self._p, pose[:2].copy(), float(pose[2])
         passed_s, way_m = 0.0, math.inf
         if self._last is not None:
             passed_s, way_m = max(stamp_ns - self._last[0], 0) * 1e-9, math.dist(place_m, self._last[1])
         is_first, self._last = self._last is None, (stamp_ns, place_m)
         rho = p.same_place * max(1.0 - way_m / CELL_M, 0.0)
         self._follow(place_m)
-        self._eye, self._near_m = self._in_cells(self.viewpoint(T_odom_base)[:2, 3]), float(belief.ends_m[0])
+        self._eye, self._near_m = self._in_cells(self.viewpoint(pose)[:2]), float(belief.ends_m[0])
         # 1. Evidence and state of each cell.
-        found, states = self._gathered(T_odom_base, belief)
+        found, states = self._gathered(yaw, belief)
         in_view, past, hidden = (states == one for one in (kernels.IN_VIEW, kernels.SEEN_PAST, kernels.HIDDEN))
         observed = in_view & (found[kernels.VIEW] > 0.5)
         # 2. What is new of it.
@@ -220,14 +208,17 @@ class ObstacleGrid:
         grid = FloorGrid(np.asarray(CELL_M * (self._cell - REACH_CELLS), float), cells)
         return GridScan(*self._ways(taken, self._in_cells(place_m), yaw), arrivals, grid)
 
-    def is_floor(self, T_odom_base: Array, ranges_m: Array) -> Flags:
-        """Return the bins (N, DIRECTIONS) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
+    def is_floor(self, pose: Array, ranges_m: Array) -> Flags:
+        """Return the bins (N, DIRECTIONS) about the viewpoint, at ranges (N,), whose cells are floor by all pairs.
+
+        pose (3,): of the base in odom.
+        """
         if self._cell is None:
             return np.zeros((len(ranges_m), len(AZIMUTHS)), bool)
-        T = T_odom_base @ se3.inverse(self._T_rect_base)
-        unit = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)]) @ T[:2, :2].T / CELL_M
+        azimuths_rad = AZIMUTHS - self._turn_rad + pose[2]
+        unit = np.stack([np.cos(azimuths_rad), np.sin(azimuths_rad)]) / CELL_M
         # OpenCV has integers at the middles of cells.
-        at = (self._in_cells(T[:2, 3]) - 0.5)[:, None, None] + ranges_m[:, None] * unit.T[:, None]
+        at = (self._in_cells(self.viewpoint(pose)[:2]) - 0.5)[:, None, None] + ranges_m[:, None] * unit[:, None]
         x, y = np.asarray(at, np.float32)
         floor = ((self._known > 0) & (self.odds < self._p.floor)).view(np.uint8)
         return np.asarray(cv2.remap(floor, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0)
@@ -239,7 +230,7 @@ class ObstacleGrid:
         """
         ranges_m, taken = self._along(cells, place, yaw_rad)
         # 1. Free is up to where the probability that a thing stands on the way is at most the risk.
-        has_ended = 1 - np.cumprod(1 - np.minimum(taken, 1), axis=1) > self._p.risk
+        has_ended = 1 - np.cumprod(1 - np.minimum(taken, 1), axis=1) > RISK
         free_m = np.where(has_ended.any(axis=1), has_ended.argmax(axis=1) * CELL_M, self._max_range_m)
         # 2. The first cells in a row in which a thing is more likely than not.
         is_thing = (taken > 0.5) & (taken <= 1)
@@ -314,9 +305,8 @@ class ObstacleGrid:
                 reach_m[run] = 0.0
         reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
         y, x = np.indices((SIDE, SIDE)) + 0.5 - self._eye[::-1, None, None]
-        T = self._T_rect_base
-        turn = math.atan2(T[1, 0], T[0, 0]) - yaw_rad
-        at = np.floor((math.pi - np.arctan2(y, x) - turn) / math.tau * count).astype(np.intp) % count
+        turn_rad = self._turn_rad - yaw_rad
+        at = np.floor((math.pi - np.arctan2(y, x) - turn_rad) / math.tau * count).astype(np.intp) % count
         free = self._ranges_m(self._eye) < reach_m[at]
         self._known[free], self._past_views[free] = 1, p.views
         self.odds[free & (self.odds < 0)] = p.arrival
@@ -356,20 +346,17 @@ class ObstacleGrid:
             source = np.asarray(cv2.dilate(source, CROSS if step % 2 else SQUARE), np.uint8) & wide
         self._known[source > 0] = 0
 
-    def _gathered(self, T_odom_base: Array, belief: RayBelief) -> tuple[Floats, Bytes]:
+    def _gathered(self, yaw_rad: float, belief: RayBelief) -> tuple[Floats, Bytes]:
         """Return evidence (3, SIDE, SIDE) and states (SIDE, SIDE) of the cells."""
-        T = self._T_rect_base @ se3.inverse(T_odom_base)
-        turn = math.atan2(T[1, 0], T[0, 0])
+        turn_rad = self._turn_rad - yaw_rad
         y, x = np.indices((SIDE, SIDE), np.float32) + np.float32(0.5) - self._eye[::-1, None, None].astype(np.float32)
-        directions = ((math.pi - turn) - np.arctan2(y, x)) * (len(belief.first) / math.tau) - 0.5
+        directions = ((math.pi - turn_rad) - np.arctan2(y, x)) * (len(belief.first) / math.tau) - 0.5
         cells, states = np.empty((3, SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.uint8)
         near = np.where(belief.view[:, 0] > 0, np.where(self._hides(belief), 2, 1), 0).astype(np.uint8)
         reach_m = min(float(belief.ends_m[-2]), self._max_range_m)
-        of_belief, of_cells = (
-            (belief.ratios, belief.view, belief.surface, near, belief.ends_m),
-            (np.hypot(x, y) * np.float32(CELL_M), directions),
-        )
-        kernels.gather(*of_belief, self._at_1m, *of_cells, CELL_M, reach_m, THIN_M, cells, states)
+        of_belief = belief.ratios, belief.view, belief.surface, near, belief.ends_m, self._at_1m
+        ranges_m = np.hypot(x, y) * np.float32(CELL_M)
+        kernels.gather(*of_belief, ranges_m, directions, CELL_M, reach_m, THIN_M, cells, states)
         return cells, states
 
     def _follow(self, place_m: Array) -> None:

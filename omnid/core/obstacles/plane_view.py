@@ -17,6 +17,7 @@ from typing import Final, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from calib import se3
@@ -24,7 +25,7 @@ from calib.panorama import Cylinder
 from drivers.jpeg import coding_sigma
 from omnid.core.obstacles import evidence_kernels as kernels
 from omnid.core.obstacles.evidence_kernels import UNITS
-from omnid.core.obstacles.ray_kernels import PARAMETERS, add_weighted_rows
+from omnid.core.obstacles.ray_kernels import PARAMETERS
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -198,7 +199,7 @@ class PlaneView:
         self.bins = bins
         # What lies beyond the bins shows the foot of what ends the floor.
         row_of = self._rows_of(np.concatenate([bins.numbers, np.arange(1, BINS_PER_PX * self._first_disparity)[::-1]]))
-        self._step_weights, self._grey_weights = _step_weights(row_of, self.height)
+        self._row_weights = _row_weights(row_of, self.height)
         row_of = row_of[:, : len(bins.numbers)]
         self._bin_rows = np.clip(np.rint(row_of).astype(int), 0, self.height - 1)
         self._in_view = (row_of[1] + STEP_ROWS < self.last_row)[:, None]
@@ -225,10 +226,7 @@ class PlaneView:
         """Return what a pair shows of the bins, by its greys and by stereo."""
         # 1. Steps of grey, and greys.
         count, numbers = len(self.bins.numbers), self.bins.numbers
-        steps, greys = np.zeros((2, self._step_weights.shape[1], DIRECTIONS), np.float32)
-        for weights, into in ((self._step_weights, steps), (self._grey_weights, greys)):
-            for of_view, image in zip(weights, (pair.lower, pair.upper), strict=True):
-                add_weighted_rows(of_view, image, into)
+        steps, greys = np.split(self._row_weights @ np.concatenate([pair.lower, pair.upper]), 2)
         far = np.abs(pooled(steps[count:])).max(axis=0, initial=0.0)
         # 2. Surfaces. They fit a little at the next disparities, too.
         live = pair.seen * np.uint8(255)
@@ -362,8 +360,8 @@ def turned(values: Floats, count: int) -> Floats:
     return np.concatenate([values[:, -count:], values, values[:, :count]], axis=1)
 
 
-def _step_weights(rows: Array, height: int) -> tuple[Floats, Floats]:
-    """Return the weights (2, N, H) of the rows of both views for steps of grey at rows (2, N), and for greys there.
+def _row_weights(rows: Array, height: int) -> scipy.sparse.csr_array:
+    """Return the weights (2 N, 2 H) of the rows of both views for steps of grey at rows (2, N), then for greys there.
 
     A step is the difference of the means of 2.6 rows on either side, less the trend of the rows beyond: a shading is no
     edge.
@@ -373,11 +371,11 @@ def _step_weights(rows: Array, height: int) -> tuple[Floats, Floats]:
     def mean(first: float, end: float) -> Array:
         low, high = (np.clip(rows[..., None] + at, 0, height - 1) for at in (first, end))
         part = np.clip(np.minimum(high, edges + 1) - np.maximum(low, edges), 0, None)
-        return np.asarray(part / np.maximum(part.sum(axis=-1, keepdims=True), 1e-6))
+        return np.hstack(part / np.maximum(part.sum(axis=-1, keepdims=True), 1e-6))
 
     above, below, before, beyond = mean(-3.6, -1.0), mean(1.0, 3.6), mean(-8.0, -3.6), mean(3.6, 8.0)
     step = above - below - 0.575 * (before - above + below - beyond)
-    return (step / 2).astype(np.float32), (mean(-1.1, 1.1) / 2).astype(np.float32)
+    return scipy.sparse.csr_array((np.vstack([step, mean(-1.1, 1.1)]) / 2).astype(np.float32))
 
 
 Map = tuple[NDArray[np.int16], NDArray[np.uint16]]

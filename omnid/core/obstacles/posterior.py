@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
+RISK: Final = 0.1  # probability of a thing on a way that is free
 MAD: Final = 1.48  # sigma of a normal distribution by the median of its magnitudes
 LEAST_STEP: Final = 0.35  # sigma of a step by the rounding of greys
 TYPICAL_M: Final = 1.3  # range at which the near floor is seen
@@ -55,7 +56,7 @@ class RayBelief(NamedTuple):
     ends_m: Array  # (N + 1,) range at which the bins begin, from near to far, and the end of the last
 
 
-def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
+def thin_things_m(belief: RayBelief) -> FreeRanges:
     """Return the least range (SECTORS,) [m] at which something thin may hide the floor, inf where nothing does.
 
     The way along such a ray ends by a risk, the probability that something stands on it, while that along the rays 5 to
@@ -64,7 +65,7 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
     """
     met = np.cumsum(belief.first[:, :-1], axis=1)  # (D, N)
     beside = [np.mean([np.roll(met, side * shift, axis=0) for shift in BESIDE], axis=0) for side in (-1, 1)]
-    ends = (met > risk) & (np.maximum(*beside) < risk**2) & (belief.view > 0)
+    ends = (met > RISK) & (np.maximum(*beside) < RISK**2) & (belief.view > 0)
     # The bin of a foot is known to two disparities.
     bins = np.maximum(ends.argmax(axis=1) - 2 * BINS_PER_PX, 0)
     begins_m = np.where(ends.any(axis=1), belief.ends_m[bins], np.inf)

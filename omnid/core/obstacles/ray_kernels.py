@@ -1,4 +1,4 @@
-"""Compiled loops over rays: weighted sums of rows, sums over the bins of a ray, and rays gathered by cells."""
+"""Compiled loops over rays: sums over the bins of a ray, and rays gathered by cells."""
 
 from __future__ import annotations
 
@@ -77,17 +77,6 @@ def log_sum(a: float, b: float) -> float:
     apart = a - b if a > b else b - a
     high = a if a > b else b
     return high + SOFT[int(apart * FINE)] if apart < MOST else high
-
-
-@compiled("(f4[:, ::1], f4[:, ::1], f4[:, ::1])", writes=("into",))
-def add_weighted_rows(weights: Floats, image: Floats, into: Floats) -> None:
-    """Add weights (N, H) @ image (H, D) to sums (N, D); few weights are not 0."""
-    for n in range(weights.shape[0]):
-        for v in range(weights.shape[1]):
-            weight = weights[n, v]
-            if weight != 0:
-                for u in range(image.shape[1]):
-                    into[n, u] += weight * image[v, u]
 
 
 @compiled(

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from calib.se2_arrays import planar, transform
+from calib.se2_arrays import planar
 from omnid.core.obstacles.evidence_kernels import UNITS, ramp_gains
-from omnid.core.obstacles.grid import GridScan, ObstacleGrid, unknown_scan
+from omnid.core.obstacles.grid import GridScan, ObstacleGrid
 from omnid.core.obstacles.plane_view import (
     AROUND_ROWS,
     AZIMUTHS,
@@ -171,13 +171,13 @@ class RayScans:
 
     def add(
         self, stamp_ns: int, T_odom_base: Array, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None
-    ) -> GridScan:
-        """Return the scan at a pair, whose base has the pose T_odom_base (4, 4).
+    ) -> GridScan | None:
+        """Return the scan at a pair, whose base has the pose T_odom_base (4, 4); None: no floor is in view.
 
         lost (H, W): pixels that are no evidence, None: all in view are.
         """
-        pose = transform(planar(T_odom_base))
-        viewpoint = planar(self.grid.viewpoint(pose))
+        pose = planar(T_odom_base)
+        viewpoint = self.grid.viewpoint(pose)
         turn_rad = math.atan2(self._T_rect_base[1, 0], self._T_rect_base[0, 0]) - viewpoint[2]
         # 1. The plane of the floor, and that of a ramp.
         start_m = math.inf if self._ramp is None else self._ramp.start_m(viewpoint)
@@ -190,7 +190,7 @@ class RayScans:
         floor = FloorPlane(floor.height_m, floor.a + float(self._used[0]), floor.b + float(self._used[1]))
         self._floor = self._seen(floor, self._floor)
         if not self._floor.shows_floor:
-            return unknown_scan()
+            return None
         # 2. What the pair shows on them.
         pair = self._floor.pair(lower, upper, lost)
         shown = self._floor.shown(pair)
@@ -224,7 +224,7 @@ class RayScans:
     def _observe_tilt(self, pose: Array, pair: WorkingPair, start_m: float, way_rad: float) -> None:
         """Take a pair into the filter of the tilt, by near floor that is known, before a ramp that begins along a way.
 
-        pose (4, 4): of the base, planar.
+        pose (3,): of the base in odom.
         """
         self._P = self._P + DRIFT_RAD**2 * np.eye(2)
         view, height_m = self._floor, self._floor.plane.height_m
