@@ -331,9 +331,7 @@ class PlaneView:
                 mine = math.ceil(max(floor * h / (h - low_m), floor + FLOOR_PX))
             below = max(math.floor(self._floor_slope * (first - self.row0) - FLOOR_PX), 0)
             found.append((first, end, max(self._first_disparity, mine), max(last, 0), fall > 0, below))
-        # Strips above the first and below the last that may show a surface are not needed.
-        useful = [n for n, (_, _, mine, last, *_) in enumerate(found) if last > mine]
-        return np.array(found[useful[0] : useful[-1] + 1] if useful else np.zeros((0, 6)), np.int32)
+        return np.array(found, np.int32).reshape(-1, 6)
 
 
 def _rows_in_use(shown: Flags, horizon: int) -> tuple[int, int]:

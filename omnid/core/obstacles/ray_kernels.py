@@ -60,7 +60,6 @@ class RayParameters(NamedTuple):
 
 PARAMETERS = RayParameters()
 FLOOR, ABOVE, BELOW, LOOK, EDGE, BARE, BEGINS, FITS = range(8)  # terms of `posterior`
-UPRIGHT, STEP = 0, 1  # classes of what begins
 APART = 6  # bins from which a surface is another one, as one fits within two disparities around
 LEAST_REACH = 0.01  # probability of a ray that it comes to a bin, below which it says nothing of it
 
@@ -68,7 +67,6 @@ LEAST_REACH = 0.01  # probability of a ray that it comes to a bin, below which i
 # log(1 + exp(-x)) in steps of 1 / FINE from 0 on: a ray needs hundreds of sums of likelihoods by their logarithms.
 FINE, MOST = 128.0, 30.0
 SOFT = np.log1p(np.exp(-(np.arange(int(FINE * MOST) + 2) + 0.5) / FINE))
-LOG_2 = math.log(2.0)
 
 
 @inner
@@ -103,7 +101,7 @@ def posterior(
     p = PARAMETERS
     bins, directions = terms.shape[1:]
     up, down, look, later = np.zeros(bins + 1), np.zeros(bins + 1), np.zeros(bins + 1), np.zeros(bins + 1)
-    of_class, total = np.empty((2, bins)), np.empty(bins)
+    upright, steps, total = np.empty(bins), np.empty(bins), np.empty(bins)
     # Logarithms of all that does not depend on the direction.
     log_length, log_stays, log_changes, prior_odds = np.log(lengths_m), np.empty(bins), np.empty(bins), np.empty(bins)
     for n in range(bins):
@@ -116,7 +114,7 @@ def posterior(
     log_alike, log_unlike = math.log(p.alike), math.log1p(-p.alike)
     other_at_start = min(0.1 * p.changes_per_m * nearest_m, 0.5)
     log_known, log_other = math.log1p(-other_at_start), math.log(other_at_start)
-    log_nearer = math.log(p.nearer)
+    log_nearer, log_2 = math.log(p.nearer), math.log(2.0)
     for u in range(directions):
         # 1. Sums from each bin to the last: planes beside the floor, look, and things behind the first one.
         plain = 0.0
@@ -136,21 +134,21 @@ def posterior(
             alike = log_sum(log_alike + min(max(look[n], -30.0), 30.0), log_unlike)
             here = before + looks - own + terms[BEGINS, n, u] + alike + math.log1p(later[min(n + APART, bins)])
             here += log_length[n]
-            of_class[UPRIGHT, n] = here + terms[FITS, n, u] + log_things
-            of_class[STEP, n] = here + log_sum(down[n], up[n]) + log_steps
+            upright[n] = here + terms[FITS, n, u] + log_things
+            steps[n] = here + log_sum(down[n], up[n]) + log_steps
             slope = log_sum(slope, before + looks + up[n] + look[n] + log_slopes + log_length[n])
             before += terms[FLOOR, n, u] + terms[EDGE, n, u]
             kept = log_sum(as_known + log_stays[n], other_look + log_changes[n]) + terms[LOOK, n, u]
             other_look = log_sum(other_look + log_stays[n], as_known + log_changes[n])
             as_known, looks = kept, log_sum(kept, other_look)
-        none = log_sum(before + looks + foot - LOG_2, slope + foot)
+        none = log_sum(before + looks + foot - log_2, slope + foot)
         # 4. Nearer than the view: the look of floor may have been learned from it, or it has one of its own.
         #    What is plain shows fewer edges.
-        nearer = log_nearer + log_sum(look[0], log_sum(0.0, plain) - LOG_2)
+        nearer = log_nearer + log_sum(look[0], log_sum(0.0, plain) - log_2)
         # 5. Something that hangs over floor in view: all that may begin beyond.
         beyond = high = none
         for n in range(bins - 1, -1, -1):
-            begins = log_sum(of_class[UPRIGHT, n], of_class[STEP, n])
+            begins = log_sum(upright[n], steps[n])
             hanging = beyond + terms[FITS, n, u] - p.surface_noise + log_over + log_length[n]
             total[n] = log_sum(begins, hanging)
             beyond = log_sum(beyond, begins)
