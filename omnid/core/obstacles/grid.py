@@ -37,6 +37,7 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+Rays = tuple[Indices, Indices]  # rows and columns (SECTORS, REACH_CELLS) of cells along the sectors
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ class GridParameters:
 CELL_M: Final = 0.05
 REACH_CELLS: Final = 90  # of the grid, on either side of the cell of the base
 SIDE: Final = 2 * REACH_CELLS + 1
+STEPS_M: Final = CELL_M * (np.arange(REACH_CELLS) + 0.5)  # ranges of cells along a ray
 OWN: Final = slice(REACH_CELLS - 3, REACH_CELLS + 4)  # cells that nothing but the base can be in
 CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
@@ -118,7 +120,8 @@ class ObstacleGrid:
         self._max_range_m = min(max_range_m, REACH_CELLS * CELL_M)
         self._eye_base, self._turn_rad = np.zeros(2), 0.0  # viewpoint in base axes, and angle of these to the columns'
         self._cell: NDArray[np.int64] | None = None  # of the base, in odom
-        self._eye, self._near_m = np.zeros(2), 0.0  # viewpoint in cells of the grid, and the nearest floor in view
+        # Viewpoint in cells of the grid, the nearest floor in view, and ranges (SIDE, SIDE) of cells.
+        self._eye, self._near_m, self._ranges_m = np.zeros(2), 0.0, np.zeros((SIDE, SIDE), np.float32)
         self._forget()
 
     def viewpoint(self, pose: Array) -> Array:
@@ -139,7 +142,7 @@ class ObstacleGrid:
         if self._cell is None:
             return
         cell, odds = self._cell, self.odds
-        kept = (self._ranges_m(self._eye) < self._near_m) & (odds > 0)
+        kept = (self._ranges_m < self._near_m) & (odds > 0)
         self._forget()
         self.odds[kept], self._known[kept], self._cell = odds[kept], 1, cell
 
@@ -171,8 +174,16 @@ class ObstacleGrid:
         rho = p.same_place * max(1.0 - way_m / CELL_M, 0.0)
         self._follow(place_m)
         self._eye, self._near_m = self._in_cells(self.viewpoint(pose)[:2]), float(belief.ends_m[0])
-        # 1. Evidence and state of each cell.
-        found, states = self._gathered(yaw, belief)
+        # 1. Evidence and state of each cell, by its range and direction from the viewpoint.
+        y, x = np.indices((SIDE, SIDE), np.float32) + np.float32(0.5) - self._eye[::-1, None, None].astype(np.float32)
+        count, self._ranges_m = len(belief.first), np.hypot(x, y) * np.float32(CELL_M)
+        columns = ((math.pi - self._turn_rad + yaw) - np.arctan2(y, x)) * (count / math.tau) - 0.5
+        found, states = np.empty((3, SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.uint8)
+        hides = self._hides(belief)
+        near = np.where(belief.view[:, 0] > 0, np.where(hides, 2, 1), 0).astype(np.uint8)
+        of_belief = belief.ratios, belief.view, belief.surface, near, belief.ends_m, self._at_1m
+        reach_m = min(float(belief.ends_m[-2]), self._max_range_m)
+        kernels.gather(*of_belief, self._ranges_m, columns, CELL_M, reach_m, THIN_M, found, states)
         in_view, past, hidden = (states == one for one in (kernels.IN_VIEW, kernels.SEEN_PAST, kernels.HIDDEN))
         observed = in_view & (found[kernels.VIEW] > 0.5)
         # 2. What is new of it.
@@ -190,10 +201,11 @@ class ObstacleGrid:
         self._past_views[taken_back] = np.maximum(self._past_views[taken_back] - p.views * (1 - rho), 0)
         self._known[observed | (past & (self._past_views >= p.views))] = 1
         if is_first:
-            self._assume_free(yaw, belief)
+            self._assume_free(columns, hides, belief)
         # 4. What hides the nearest floor in view, behind which floor was seen before, may stand anywhere before it.
         #    What hides it from the start may stand where it did. And who comes where nobody sees.
-        flooded = self._flooded(hidden, yaw)
+        rays = _along(self._eye, yaw)
+        flooded = self._flooded(hidden, rays)
         if not is_first:
             watched = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
             self._who_comes(passed_s, watched)
@@ -201,7 +213,7 @@ class ObstacleGrid:
         self._known[flooded > 0] = 0
         # 5. Who has come, and the scan.
         taken = self._taken()
-        arrivals = self._arrivals(passed_s, yaw, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
+        arrivals = self._arrivals(passed_s, rays, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
         self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN], taken[OWN, OWN] = p.arrival, 1, 0, 0
         assert self._cell is not None
         cells = np.where(taken > 1, np.float32(np.nan), taken)
@@ -228,7 +240,8 @@ class ObstacleGrid:
 
         cells (SIDE, SIDE): probability of a thing, 2 where nothing is known.
         """
-        ranges_m, taken = self._along(cells, place, yaw_rad)
+        count = round(self._max_range_m / CELL_M)
+        ranges_m, taken = STEPS_M[:count], cells[_along(place, yaw_rad)][:, :count].astype(float)
         # 1. Free is up to where the probability that a thing stands on the way is at most the risk.
         has_ended = 1 - np.cumprod(1 - np.minimum(taken, 1), axis=1) > RISK
         free_m = np.where(has_ended.any(axis=1), has_ended.argmax(axis=1) * CELL_M, self._max_range_m)
@@ -245,25 +258,25 @@ class ObstacleGrid:
         sigma_m = np.sqrt(variance + CELL_M**2 / 12)
         return hit_m.astype(np.float32), sigma_m.astype(np.float32), free_m.astype(np.float32)
 
-    def _flooded(self, hidden: Flags, yaw_rad: float) -> Bytes:
+    def _flooded(self, hidden: Flags, rays: Rays) -> Bytes:
         """Return the cells (1) before the nearest floor in view, hidden (SIDE, SIDE) where it was seen, of ways on
-        which nothing is known that hides it."""
+        which nothing is known that hides it; rays: of the viewpoint."""
         flooded = np.zeros((SIDE, SIDE), np.uint8)
         candidates = hidden & (self._was_past > 0)
         if not candidates.any():
             return flooded
-        ranges_m, taken = self._along(self._taken(), self._eye, yaw_rad)
-        explained = ((taken > 0.3) & (taken <= 1) & (ranges_m < self._near_m + 3 * CELL_M)).any(axis=1)
+        taken = self._taken()[rays]
+        explained = ((taken > 0.3) & (taken <= 1) & (self._near_m + 3 * CELL_M > STEPS_M)).any(axis=1)
         explained = np.any([np.roll(explained, shift) for shift in range(-2, 3)], axis=0)
-        rows, columns = (of[~explained][:, ranges_m < self._near_m] for of in _along(self._eye, yaw_rad))
+        rows, columns = (of[~explained][:, self._near_m > STEPS_M] for of in rays)
         flooded[rows, columns] = candidates[rows, columns]
         return _without_specks(flooded)
 
-    def _arrivals(self, passed_s: float, yaw_rad: float, taken: Floats, shows: Flags, flooded: Bytes) -> Arrivals:
+    def _arrivals(self, passed_s: float, rays: Rays, taken: Floats, shows: Flags, flooded: Bytes) -> Arrivals:
         """Return who has come onto floor that was free a short while ago.
 
-        taken (SIDE, SIDE): probability of a thing; shows: where this pair shows one; flooded: 1 where one may that
-        hides the nearest floor.
+        rays: of the viewpoint; taken (SIDE, SIDE): probability of a thing; shows: where this pair shows one; flooded: 1
+        where one may that hides the nearest floor.
         """
         p = self._p
         self._free_s += np.float32(passed_s)
@@ -273,9 +286,8 @@ class ObstacleGrid:
         came = ((taken > 0.5) & (taken <= 1)) | (flooded > 0)
         came |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
         # The first one of each direction, before floor that was free, by the noise of stereo and more.
-        rays, step_m = _along(self._eye, yaw_rad), CELL_M * (np.arange(REACH_CELLS) + 0.5)
         first = came[rays].argmax(axis=1)
-        ranges_m = np.where(came[rays].any(axis=1), step_m[first], np.nan)
+        ranges_m = np.where(came[rays].any(axis=1), STEPS_M[first], np.nan)
         before_m = p.behind_m + 1.5 * ranges_m**2 / self._at_1m
         end = np.nan_to_num(first + np.ceil(before_m / CELL_M), nan=SIDE).astype(np.intp)
         others = np.cumsum(np.pad(~lately[rays], ((0, 0), (1, 0))), axis=1)
@@ -292,22 +304,19 @@ class ObstacleGrid:
         ranges_m[is_nearer] = self._near_m
         return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32), is_nearer)
 
-    def _assume_free(self, yaw_rad: float, belief: RayBelief) -> None:
+    def _assume_free(self, columns: Floats, hides: Flags, belief: RayBelief) -> None:
         """Take the floor too near to be seen for free at the start, but where something hides the nearest in view.
 
         That may stand anywhere before the floor that it hides. Nothing is assumed where no floor is in view, in wider
-        directions than a strut or a mast hides.
+        directions than a strut or a mast hides. columns (SIDE, SIDE): directions of cells; hides (D,).
         """
-        p, count = self._p, len(belief.first)
-        reach_m = np.where(self._hides(belief), 0.0, self._near_m + 2 * CELL_M)
+        p, count = self._p, len(hides)
+        reach_m = np.where(hides, 0.0, self._near_m + 2 * CELL_M)
         for run in runs(belief.view[:, 0] <= 0):
             if len(run) * math.tau / count >= p.strut_rad:
                 reach_m[run] = 0.0
         reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
-        y, x = np.indices((SIDE, SIDE)) + 0.5 - self._eye[::-1, None, None]
-        turn_rad = self._turn_rad - yaw_rad
-        at = np.floor((math.pi - np.arctan2(y, x) - turn_rad) / math.tau * count).astype(np.intp) % count
-        free = self._ranges_m(self._eye) < reach_m[at]
+        free = self._ranges_m < reach_m[np.floor(columns + 0.5).astype(np.intp) % count]
         self._known[free], self._past_views[free] = 1, p.views
         self.odds[free & (self.odds < 0)] = p.arrival
 
@@ -325,12 +334,6 @@ class ObstacleGrid:
         taken = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
         return np.where((self._known > 0) | (self.odds > 0), taken, np.float32(2))
 
-    def _along(self, cells: Floats, place: Array, yaw_rad: float) -> tuple[Array, Array]:
-        """Return ranges (R,) [m] from a place [cells], and what cells have along the sectors (SECTORS, R)."""
-        count = round(self._max_range_m / CELL_M)
-        taken = cells[_along(place, yaw_rad)][:, :count]
-        return CELL_M * np.linspace(0.5, count - 0.5, count), np.asarray(taken, np.float64)
-
     def _who_comes(self, passed_s: float, watched: Flags) -> None:
         """Spread what is not known through cells that nobody sees."""
         p = self._p
@@ -345,19 +348,6 @@ class ObstacleGrid:
         for step in range(min(steps, SIDE)):
             source = np.asarray(cv2.dilate(source, CROSS if step % 2 else SQUARE), np.uint8) & wide
         self._known[source > 0] = 0
-
-    def _gathered(self, yaw_rad: float, belief: RayBelief) -> tuple[Floats, Bytes]:
-        """Return evidence (3, SIDE, SIDE) and states (SIDE, SIDE) of the cells."""
-        turn_rad = self._turn_rad - yaw_rad
-        y, x = np.indices((SIDE, SIDE), np.float32) + np.float32(0.5) - self._eye[::-1, None, None].astype(np.float32)
-        directions = ((math.pi - turn_rad) - np.arctan2(y, x)) * (len(belief.first) / math.tau) - 0.5
-        cells, states = np.empty((3, SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.uint8)
-        near = np.where(belief.view[:, 0] > 0, np.where(self._hides(belief), 2, 1), 0).astype(np.uint8)
-        reach_m = min(float(belief.ends_m[-2]), self._max_range_m)
-        of_belief = belief.ratios, belief.view, belief.surface, near, belief.ends_m, self._at_1m
-        ranges_m = np.hypot(x, y) * np.float32(CELL_M)
-        kernels.gather(*of_belief, ranges_m, directions, CELL_M, reach_m, THIN_M, cells, states)
-        return cells, states
 
     def _follow(self, place_m: Array) -> None:
         """Move the cells along with the base; those that come into the grid are unknown."""
@@ -375,15 +365,10 @@ class ObstacleGrid:
         assert self._cell is not None
         return np.asarray(place_m / CELL_M - self._cell + REACH_CELLS)
 
-    def _ranges_m(self, place: Array) -> Array:
-        """Return the distances (SIDE, SIDE) of cells from a place [cells]."""
-        y, x = np.indices((SIDE, SIDE)) + 0.5 - place[::-1, None, None]
-        return np.asarray(np.hypot(x, y) * CELL_M)
 
-
-def _along(place: Array, yaw_rad: float) -> tuple[Indices, Indices]:
+def _along(place: Array, yaw_rad: float) -> Rays:
     """Return rows and columns (SECTORS, REACH_CELLS) of cells along the sectors, from a place [cells], a cell apart."""
-    angle, steps = azimuths() + yaw_rad, np.arange(REACH_CELLS) + 0.5
+    angle, steps = azimuths() + yaw_rad, STEPS_M / CELL_M
     unit = np.column_stack([np.sin(angle), np.cos(angle)])
     rows, columns = np.floor(place[::-1] + steps[:, None, None] * unit).astype(np.intp).T
     return np.clip(rows, 0, SIDE - 1), np.clip(columns, 0, SIDE - 1)
