@@ -165,7 +165,7 @@ class Odometry:
                 )
             # 3. Estimate the motion.
             self._stamp_ns = stamp_ns
-            return self._front_end.process(pair)
+            return self._front_end.pose(pair)
 
     def depth(self, pose: OdometryUpdate) -> DensePoints:
         """Return the dense depth of a pair that `process` has given the pose of; it is computed the first time.

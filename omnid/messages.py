@@ -23,7 +23,6 @@ from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
-from omnid.core.places.place_map import PlaceMap
 from omnid.core.stereo.photometry import Light
 from omnid.core.stereo.tiles import ALL_LIVE, TileStates
 from omnid.core.types.panorama import PaddedPanorama
@@ -137,20 +136,6 @@ class MapKeyframes:
     T_map_rect: Mapping[int, Array]  # (4, 4) of the rectified frame
 
 
-class SaveMap(NamedTuple):
-    """A request to write the map."""
-
-    id: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapCopy:
-    """A copy of the map that is to be written, and the ids of the newest requests for it."""
-
-    places: PlaceMap
-    ids: tuple[int, ...] = ()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceUpdate:
     """Pose in the map after a pair: odom stays smooth, and T_map_odom carries the corrections (REP 105)."""
@@ -168,7 +153,6 @@ class PlaceUpdate:
     keyframes: MapKeyframes | None = None  # the same object while the map stays
     # False: in a saved map or after a gap no place has been recognised yet, so it is unknown where odom lies in the map
     is_known: bool = True
-    copy: MapCopy | None = None  # the newest one that is to be written; the same object until the next one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,10 +228,5 @@ class NavigationUpdate:
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0  # its length so far
     taught: TaughtRoute | None = None  # the newest route that is to be written; the same object until the next one
-    answers: tuple[RequestAnswer, ...] = ()  # answers to the newest requests, the newest one last
+    answer: RequestAnswer | None = None  # to the newest request; None: there was none
     plan: NavigationPlan | None = None  # None where the plan is that of the message before
-
-    @property
-    def answer(self) -> RequestAnswer | None:
-        """Answer to the newest request; None: there was none."""
-        return self.answers[-1] if self.answers else None

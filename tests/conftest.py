@@ -16,7 +16,6 @@ import pytest
 from omnid.cli import limit_blas_threads
 from omnid.core.compiled import cache_folder, why_unusable
 from omnid.engine.kernel_cache import prepare_kernels
-from tests.ports import listening
 from tests.replay.command import Command
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log
@@ -129,10 +128,3 @@ def default_signals() -> Iterator[None]:
 def omnid(capsys: pytest.CaptureFixture[str]) -> Command:
     """Return the command line as a function."""
     return Command(capsys)
-
-
-@pytest.fixture
-def taken_port() -> Iterator[int]:
-    """Yield a port on which a server listens."""
-    with listening() as port:
-        yield port

@@ -137,7 +137,7 @@ def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log:
     pairing, health = Synchronise(front_end.geometry.rig, config.pair), front_end.health
     states: Counter[TrackingState] = Counter()
     for pair in filter(None, map(pairing.process, reader.frames())):
-        update = front_end.process(pair)
+        update = front_end.pose(pair)
         states[update.state] += 1
         if health.state is RigState.EXCHANGED:
             raise OmnidError(f"{log}: {health.warning}")

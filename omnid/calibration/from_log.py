@@ -182,7 +182,7 @@ def calibrate_mask(
             pair = update.depth.panoramas
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:
                 parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
-            front_end.odometry.complete()
+            front_end.complete()
     if parts.headings < LEAST_HEADINGS:
         raise OmnidError(
             f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn, "

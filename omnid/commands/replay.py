@@ -43,8 +43,6 @@ def run(args: argparse.Namespace) -> int:
     outputs:
     --tum FILE            trajectory, T_odom_rig, one row for every pair
     --map-tum FILE        trajectory in the map, T_map_rig: places that are recognised correct all poses before them
-    --map-live-tum FILE   the same as it was known at each pose, which is what a controller gets: later places correct
-        nothing
     --cloud FILE.ply      the map's points with confidence and age
     --plan FILE.png       the map from above with the path
     --record FILE.mcap    poses, transforms, commands, states and map
@@ -75,7 +73,6 @@ def run(args: argparse.Namespace) -> int:
         span_s=(args.start_s, math.inf if args.seconds is None else args.start_s + args.seconds),
         tum=args.tum,
         map_tum=args.map_tum,
-        map_live_tum=args.map_live_tum,
         cloud=args.cloud,
         plan=args.plan,
         record=args.record,

@@ -20,16 +20,18 @@ from omnid.sinks.recorder import Recorder
 
 
 def open_recorder(
-    config: Config, rig: str, report: Report, clock: RobotClock, encode: Encoder | None = None, images_hz: float = 0.0
+    config: Config, rig: str, report: Report, clock: RobotClock, encode: Encoder | None = None
 ) -> Recorder:
     """Return a recorder to the folder of the configuration; the first message makes the first file.
 
     rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
-    report: takes severity and text of problems. encode, clock, images_hz: see Recorder.
+    report: takes severity and text of problems. clock: see Recorder. encode: of the other messages of a run, whose
+    images are thinned to record.images_hz; None: all images and nothing else are recorded.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = Path(config.record.folder)
     log = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
+    images_hz = config.record.images_hz if encode is not None else 0.0
     return Recorder(log, config.bus.robot, encode, clock=clock, skip_invalid=True, images_hz=images_hz)
 
 

@@ -37,7 +37,7 @@ from omnid.formats.plan import drawn_heights
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.runs.place_maps import RunPlaces
+from omnid.runs.files import RunPlaces
 from omnid.runs.session import Session, attached_rig, motion_topics, run_to_end
 from omnid.runs.wiring import Inputs, Outputs, WiredStages, wire
 from omnid.settings import dump
@@ -47,6 +47,7 @@ from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
+from omnid.stages.synchronise import MotionInbox
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import Diagnostics
 from omnid.transport.status_names import MOTION, entry, stage_name
@@ -64,7 +65,6 @@ class ReplayOptions:
     span_s: tuple[float, float] = WHOLE  # the part of the log, from and until in seconds after its first image
     tum: Path | None = None
     map_tum: Path | None = None
-    map_live_tum: Path | None = None  # poses in the map as they were known when they were computed
     cloud: Path | None = None
     plan: Path | None = None
     record: Path | None = None
@@ -82,7 +82,7 @@ class ReplayOptions:
     @property
     def files(self) -> list[tuple[str, Path]]:
         """The files that are written, each with its option."""
-        names = ("tum", "map_tum", "map_live_tum", "cloud", "plan", "record")
+        names = ("tum", "map_tum", "cloud", "plan", "record")
         return [(f"--{name.replace('_', '-')}", path) for name in names if (path := getattr(self, name)) is not None]
 
 
@@ -163,7 +163,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
     logs = [log, *sorted(log.glob("*.mcap"))]  # those of a folder also by another name
     named = [*(("log", path) for path in logs), ("rig", options.rig), ("configuration", options.settings)]
     check_outputs(options.files, [(f"the {what} that is read", path) for what, path in named if isinstance(path, Path)])
-    if (options.map_tum or options.map_live_tum) and not config.places.enabled:
+    if options.map_tum and not config.places.enabled:
         raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
     graph = Graph(drops=options.drops, threaded=not options.inline)
     with ExitStack() as closing:
@@ -171,7 +171,8 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         warnings = list[str]()
         session = Session(config, graph, closing, warnings.append)
         given = read_rig(options.rig) if isinstance(options.rig, Path) else options.rig
-        reader = _opened(log, config, options, given)
+        cameras = LogCameras(*options.topics, config.cameras.bits, config.log.rate_hz, config.log.time)
+        reader = cameras.reader(log, given.topics if given else ("", ""), options.span_s, motion_topics(config))
         closing.callback(reader.close)
         geometry = session.geometry(given or attached_rig(reader, log), reader.frames())
         prepare_kernels()
@@ -194,7 +195,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             outputs.maps["collect-map"] = newest_map.append
         if options.tum:
             outputs.poses["trajectory"] = TrajectoryFile(options.tum)
-        if options.map_tum or options.map_live_tum or options.collect:
+        if options.map_tum or options.collect:
             outputs.places["collect-places"] = updates.append
         if cloud := options.cloud:  # each map replaces the file
             outputs.maps["map"] = lambda update: write_ply(cloud, update.points)
@@ -212,7 +213,8 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         if options.publish:
             bus = BusSink(session.open_bus(rig, gives_time=True), session.encoder(rig), clock=OdometryUpdate)
         outputs = replace(outputs, bus=bus, recorder=options.observer(front_end) if options.observer else recorder)
-        messages = graph.source("read", _paced(reader, graph, front_end) if options.paced else reader.messages)
+        paced = partial(_paced, reader, graph, front_end.pairing.motion)
+        messages = graph.source("read", paced if options.paced else reader.messages)
         inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
         stages = wire(config, inputs, front_end, graph, outputs)
         if options.progress is not None:
@@ -235,14 +237,10 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         # 5. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
         places = stages.places
         found = [] if places is None else [places.corrected(each) for each in updates]
-        known = np.zeros(0, bool) if places is None else places.known(updates)
         in_map, live = (np.array(T, float).reshape(-1, 4, 4) for T in (found, [each.T_map_rig for each in updates]))
-        stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
-        if options.map_tum:
-            warnings += write_trajectory(options.map_tum, stamps_ns, in_map, known)
-        if options.map_live_tum:
-            known = np.array([each.is_known for each in updates], bool)
-            warnings += write_trajectory(options.map_live_tum, stamps_ns, live, known)
+        if options.map_tum and places is not None:
+            stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
+            warnings += write_trajectory(options.map_tum, stamps_ns, in_map, places.known(updates))
         return RunResult(
             np.array([pose[0] for pose in poses], np.int64),
             np.array([pose[1] for pose in poses], np.float64).reshape(-1, 4, 4),
@@ -262,27 +260,17 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         )
 
 
-def _opened(log: Path, config: Config, options: ReplayOptions, rig: Rig | None) -> LogReader:
-    """Open the log; the topics are those of the options, else of the rig, else found by their names."""
-    cameras = LogCameras(*options.topics, config.cameras.bits, config.log.rate_hz, config.log.time)
-    return cameras.reader(log, rig.topics if rig else ("", ""), options.span_s, motion_topics(config))
-
-
-def _paced(reader: LogReader, graph: Graph, front_end: FrontEnd) -> Callable[[], Iterator[Frame]]:
-    """Return a source of the log's frames, each of which comes when its stamp is due."""
-
-    def messages() -> Iterator[Frame]:
-        offset_ns: int | None = None
-        for message in reader.messages():
-            if offset_ns is None:
-                offset_ns = time.monotonic_ns() - message.stamp_ns
-            sleep_until(message.stamp_ns + offset_ns, lambda: graph.is_stopping)
-            if isinstance(message, MotionSample):  # in the inbox of the pairing samples would replace frames
-                front_end.pairing.motion.add(message)
-            else:
-                yield message
-
-    return messages
+def _paced(reader: LogReader, graph: Graph, motion: MotionInbox) -> Iterator[Frame]:
+    """Yield the log's frames when their stamps are due; samples go to their own inbox, as they would replace frames."""
+    offset_ns: int | None = None
+    for message in reader.messages():
+        if offset_ns is None:
+            offset_ns = time.monotonic_ns() - message.stamp_ns
+        sleep_until(message.stamp_ns + offset_ns, lambda: graph.is_stopping)
+        if isinstance(message, MotionSample):
+            motion.add(message)
+        else:
+            yield message
 
 
 def _counters(
@@ -317,7 +305,7 @@ def _about_input(
         yield counters.loss
     if not counters.poses and session.graph.signal:
         return
-    fault, motion = front_end.odometry.last_fault, front_end.pairing.motion
+    fault, motion = front_end.last_fault, front_end.pairing.motion
     if fault.reason:
         yield f"{fault.reason} {fault.detail}; {ADVICE}"
     message = entry(MOTION, front_end.motion_stats()).message if motion.wheels or motion.gyro else ""
@@ -325,5 +313,5 @@ def _about_input(
         yield f"wheels and gyro: {message}"
     if stages.floor is not None and stages.floor.summary():
         yield stages.floor.summary()
-    yield from front_end.odometry.image_faults
+    yield from front_end.image_faults
     yield from input_warnings(front_end.pairing, front_end.health, session.statistics, session.config)

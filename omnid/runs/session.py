@@ -25,11 +25,12 @@ from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import Poller, started
 from omnid.errors import OmnidError
-from omnid.runs.place_maps import RunPlaces
+from omnid.runs.files import RunPlaces
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder, UnixTime
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
+from omnid.transport.status_names import BUS, Stats
 
 BUS_S: Final = 3.0  # Time until a bus must be closed.
 CLOUD_POINTS: Final = 50_000  # Most points of the map in one message.
@@ -83,6 +84,7 @@ class Session:
         self.config, self.graph, self.outputs, self.warn = config, graph, outputs, warn
         self.clock = clock or log_time()
         self.statistics = RunStatistics()
+        self.parts: dict[str, Callable[[], Stats]] = {}  # numbers of the parts of a live run, by their names
 
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
         """Return the geometry of the rig; its missing masks are looked for in frames of a log."""
@@ -110,6 +112,7 @@ class Session:
                 self.warn(f"the bus has not closed within {BUS_S:g} s: a subscriber does not read")
 
         self.outputs.callback(close)
+        self.parts[BUS] = bus.stats
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         return bus

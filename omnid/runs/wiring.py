@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,13 +12,13 @@ from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.ipc import ControllerState
 from omnid.controller.link import DriveLink
+from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.engine.graph import Graph, Output, Stream
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.runs.place_maps import RunPlaces
-from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
-from omnid.sinks.drive import LiveDrive, LockstepDrive
+from omnid.runs.files import RouteFiles, RunPlaces
+from omnid.sinks.drive import LiveDrive, LockstepDrive, navigation_answers, planner_setpoint
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.mapping import MapGrid, Mapping
@@ -26,19 +26,10 @@ from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
 from omnid.transport.codec import Diagnostics
-from omnid.transport.topics import Answer
+from omnid.transport.topics import MOST_OPEN, Answers
 
 BUS, FILES, BACKGROUND = "bus", "files", "background"  # threads that several stages and sinks share
 RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
-
-
-class Navigation(NamedTuple):
-    """The surroundings of the navigation of a run with wheels."""
-
-    requests: Requests
-    states: Stream[ControllerState]  # of the controller; an inlet of the thread that gives the commands
-    drive: Output[NavigationUpdate]
-    answer: Callable[[int, Answer], object]  # takes the id of a request whose route was written
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +39,9 @@ class Inputs:
     frames: Sequence[Stream[Frame | MotionSample]] | Sequence[Stream[Frame]]
     map: RunPlaces  # of places, to begin with, and its file
     controller: DriveLink | None = None  # that drives; None: the law in lock-step gives the commands
-    navigation: Navigation | None = None
+    # Requests to the navigation, and the states of the controller; None: the run does not navigate.
+    navigation: tuple[Stream[NavigationCommand], Stream[ControllerState]] | None = None
+    reports: Stream[Diagnostics] | None = None  # the status of a live run, whose images are recorded as well
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
 
@@ -62,10 +55,10 @@ class Outputs:
     maps: dict[str, Output[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Output[PlaceUpdate]] = field(default_factory=dict)
     scans: dict[str, Output[ObstacleScan]] = field(default_factory=dict)  # in the thread of the scans
+    ways: dict[str, Output[NavigationUpdate]] = field(default_factory=dict)  # in the thread of the navigation
+    answers: Output[Answers] | None = None  # to requests
     bus: Output[Outgoing] | None = None  # takes all messages that leave the run
     recorder: Output[Any] | None = None  # takes them as well
-    records_images: bool = False  # the recorder of a live run takes the images, too
-    reports: Stream[Diagnostics] | None = None  # for bus and recorder
 
 
 class WiredStages(NamedTuple):
@@ -83,23 +76,22 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     Else decoding and dewarping are one bounded inbox ahead of the odometry. Places, obstacles and navigation have a
     thread each. What no wheel waits for shares one: the map, what draws or encodes it, and sinks that write.
     """
-    geometry, run_map, navigation = front_end.geometry, inputs.map, inputs.navigation
+    geometry, run_map, controller = front_end.geometry, inputs.map, inputs.controller
     T_base_rig = geometry.rig.T_base_rig
     T_base_rect = T_base_rig @ geometry.T_rig_rect
-    routes = RouteFolder(Path(config.navigation.routes))
     takes_all = outputs.bus is not None or outputs.recorder is not None
     mapping, places, obstacles = None, None, None
-    maps, in_map, grids, scans, written, ways = None, None, None, None, None, None
+    maps, in_map, grids, scans, ways = None, None, None, None, None
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *inputs.frames)
     panoramas = graph.stage("dewarp", front_end.dewarp, pairs, thread="pair")
-    poses = graph.stage("odometry", front_end.odometry, panoramas, thread="pair" if graph.drops else "")
+    poses = graph.stage("odometry", front_end, panoramas, thread="pair" if graph.drops else "")
 
     # 2. Poses go to the controller, which waits for no stage.
-    if inputs.controller is not None:
-        graph.sink("controller", LiveDrive(inputs.controller, T_base_rig), poses, thread=poses.thread)
-        commands = graph.source("drive", inputs.controller.commands, wake=inputs.controller.end)
+    if controller is not None:
+        graph.sink("controller", LiveDrive(controller, T_base_rig), poses, thread=poses.thread)
+        commands = graph.source("drive", controller.commands, wake=controller.end)
     else:
         law = LockstepDrive(config.controller, 1.0 / config.motor.rate_hz, T_base_rig)
         commands = graph.stage("drive", law, poses, thread=poses.thread)
@@ -108,33 +100,36 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     if outputs.maps or takes_all:
         mapping = Mapping(config.mapping, front_end.dense, inputs.map_every_s, keyframes_only=graph.drops)
         maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
-    if navigation is not None:  # requests about routes pass through the thread of the files
-        written = graph.stage("routes", RouteFiles(routes), navigation.requests.of_routes, thread=FILES)
-    if config.places.enabled and (outputs.places or takes_all or navigation or run_map.places is not None):
-        save_s = config.places.save_s if run_map.requests else 0.0
-        places = Places(geometry, config, front_end.dense, run_map.places, save_s)
-        in_map = graph.stage("places", places, poses, *run_map.requests)
-        if run_map.requests:
-            graph.sink("save", run_map, in_map, thread=FILES)
+    if config.places.enabled and (outputs.places or takes_all or inputs.navigation or run_map.places is not None):
+        places = Places(geometry, config, front_end.dense, run_map.places)
+        in_map = graph.stage("places", places, poses)
     if in_map is not None and takes_all:
         grid = MapGrid(config.mapping.voxel_m, T_base_rect, inputs.map_every_s)
         grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
-    if config.obstacles.enabled and (outputs.scans or takes_all or navigation):
+    if config.obstacles.enabled and (outputs.scans or takes_all or inputs.navigation):
         obstacles = Obstacles(geometry, config.obstacles, front_end.dense)
         scans = graph.stage("obstacles", obstacles, poses)
 
-    # 4. All of them, and requests, give the way to drive.
-    if navigation is not None:
-        requests, states, drive, answer = navigation
-        is_new = not run_map.places or not run_map.places.keyframes
+    # 4. All of them, and requests, give the way to drive. Routes and copies of the map are written by another thread.
+    answers: list[Stream[Answers]] = []
+    if in_map is not None and run_map.saves:
+        copies = graph.stage("map-copies", run_map.copy, in_map, thread=in_map.thread)
+        answers.append(graph.stage("save", run_map.write, copies, thread=FILES))
+    if inputs.navigation is not None:
+        requests, states = inputs.navigation
+        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), run_map)
         of_base = config.controller.collision, T_base_rig, T_base_rect
         map_name = config.places.map if places else ""
-        stage = NavigationStage(config.navigation, *of_base, map_name, is_new=is_new)
+        stage = NavigationStage(config.navigation, *of_base, map_name, files.routes, is_new=run_map.is_new)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
-        given = poses, in_map, scans, wheels, requests.direct, written
+        given = poses, in_map, scans, wheels, requests
         seen: list[Stream[Any]] = [stream for stream in given if stream is not None]
         ways = graph.stage("navigation", stage, *seen)
-        graph.sink("planner", drive, ways, thread=ways.thread)
+        answers.append(graph.stage("answers", navigation_answers, ways, thread=ways.thread))
+        answers.append(graph.stage("taught", files.write, ways, thread=FILES))
+        if controller is not None:
+            setpoints = graph.stage("planner", planner_setpoint, ways, thread=ways.thread)
+            graph.sink("planner-drive", controller.send, setpoints, thread=ways.thread)
 
     # 5. What is made is consumed, and leaves the run.
     consumed: list[tuple[dict[str, Any], Stream[Any] | None, str]] = [
@@ -144,11 +139,8 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         (outputs.poses, poses, BACKGROUND),
         (outputs.maps, maps, BACKGROUND),
         (outputs.places, in_map, BACKGROUND),
+        (outputs.ways, ways, "navigation"),
     ]
-    for sinks, stream, thread in consumed:
-        for name, sink in sinks.items():
-            if stream is not None:
-                graph.sink(name, sink, stream, thread=thread)
     leaving: list[tuple[str, Stream[Any] | None, str]] = [
         ("bus", poses, BUS),
         ("bus-drive", commands, BUS),
@@ -157,21 +149,24 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         ("bus-grid", grids, FILES),
         ("bus-scan", scans, BUS),
         ("bus-navigation", ways, BUS),
-        ("bus-status", outputs.reports, BUS),
+        ("bus-status", inputs.reports, BUS),
     ]
+    if outputs.answers is not None:
+        graph.sink("answer", outputs.answers, *answers, thread=BUS, depth=MOST_OPEN)
     if outputs.recorder is not None:
-        images = inputs.frames if outputs.records_images else ()
-        depth = RECORDED_DEPTH if outputs.records_images else 0
+        images = inputs.frames if inputs.reports is not None else ()
+        depth = RECORDED_DEPTH if inputs.reports is not None else 0
         made = (stream for _, stream, _ in leaving if stream is not None)
         graph.sink("record", outputs.recorder, *images, *made, depth=depth)
-    for name, stream, thread in leaving:
-        if stream is not None and outputs.bus is not None:
-            graph.sink(name, outputs.bus, stream, thread=thread)
-    if navigation is not None and ways is not None:
-        graph.sink("taught", TaughtRoutes(routes, run_map.requests, answer), ways, thread=FILES)
+    if outputs.bus is not None:
+        consumed += [({name: outputs.bus}, stream, thread) for name, stream, thread in leaving]
+    for sinks, stream, thread in consumed:
+        for name, sink in sinks.items():
+            if stream is not None:
+                graph.sink(name, sink, stream, thread=thread)
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
-    graph.sink("keyframes", lambda _: front_end.odometry.complete(), poses, thread=poses.thread)
+    graph.sink("keyframes", lambda _: front_end.complete(), poses, thread=poses.thread)
     user = places or obstacles
     return WiredStages(mapping, places, None if user is None else user.floor)
 

@@ -29,16 +29,16 @@ from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
 from omnid.engine.graph import Graph, Output, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.runs.place_maps import RunPlaces
-from omnid.runs.route_files import Requests
+from omnid.runs.files import RunPlaces
 from omnid.runs.session import run_to_end
-from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
+from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER, controller_pose
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.obstacles import controller_scan
+from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ def simulate(
     # 2. The stages of the daemon, which work while frames and samples are yielded, and what they give the robot.
     graph = Graph(threaded=False)
     front_end = FrontEnd(geometry(rig, config.panorama), config)
-    requests, states = Requests(graph), graph.inlet(1)
+    requests, states = graph.inlet(MOST_OPEN), graph.inlet(1)
     newest = deque[OdometryUpdate](maxlen=1)
 
     def messages() -> Iterator[Frame | MotionSample]:
@@ -176,13 +176,13 @@ def simulate(
                 ends = True
             else:
                 states.push(state)
-                requests.put(NavigationCommand(request, arrival_ns, arrival_ns, stop_count=state.stop_count))
+                requests.push(NavigationCommand(request, arrival_ns, arrival_ns, stop_count=state.stop_count))
         states.push(state)
         return ends
 
     def take_pose(odometry: OdometryUpdate) -> None:
         newest.append(odometry)
-        estimate = of_base(odometry, rig.T_base_rig)[0], odometry.state, front_end.odometry.motion.is_slipping
+        estimate = of_base(odometry, rig.T_base_rig)[0], odometry.state, front_end.motion.is_slipping
         run.poses.append(EstimatedPose(odometry.stamp_ns, truth[odometry.stamp_ns], *estimate))
         body.post(controller_pose(odometry, rig.T_base_rig))
 
@@ -198,10 +198,11 @@ def simulate(
 
     # 3. The run.
     run_places = RunPlaces(config, front_end.geometry, nothing)
-    navigation = Navigation(requests, states, take_navigation, nothing)
-    inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=navigation)
+    inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=(requests, states))
     in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
-    outputs = Outputs(poses={"poses": take_pose}, scans={"scans": take_scan}, places=in_map)
+    outputs = Outputs(
+        poses={"poses": take_pose}, scans={"scans": take_scan}, places=in_map, ways={"planner": take_navigation}
+    )
     wire(config, inputs, front_end, graph, outputs)
     run_to_end(graph, run_places)
     return run

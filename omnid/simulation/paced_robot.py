@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from queue import SimpleQueue
-from typing import Any, Final
+from typing import Any
 
 from drivers.cameras.camera_state import CameraState
-from drivers.frame import CAMERAS, Frame
-from drivers.motion import GyroSample, MotionSample
+from drivers.frame import CAMERAS, Camera, Frame
+from drivers.motion import GyroSample
 from drivers.motor import VelocityCommand
 from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
@@ -31,14 +31,15 @@ from omnid.engine.threads import sleep_until
 from omnid.runs.session import Session
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
-from omnid.transport.status_names import Key
+from omnid.stages.synchronise import MotionInbox
+from omnid.transport.status_names import SIMULATION, Key
 
 
 class PacedRobot:
     """A LiveRobot in simulated time, and the DriveLink to its controller: see `Vehicle.post` for what arrives when."""
 
-    waits: Final = True
-    brings_samples: Final = True
+    waits = True
+    brings_samples = True
 
     def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int) -> None:
         """Set the robot up, with the controller of the settings."""
@@ -58,7 +59,9 @@ class PacedRobot:
         self.statistics = ControllerStatistics(self._ticks)
         self._commands: SimpleQueue[VelocityCommand | None] = SimpleQueue()  # None: the end
         self._contact = NO_CONTACT
-        self.states = {camera: CameraState(mode="simulated", status="streaming") for camera in CAMERAS}
+        self.states: Mapping[Camera, CameraState] = {
+            camera: CameraState(mode="simulated", status="streaming") for camera in CAMERAS
+        }
         self.truth: dict[int, Pose] = {}  # true poses of the base in the world by the stamps of the pairs
         self.contacts, self._touches, self._closed = 0, False, False
 
@@ -66,12 +69,13 @@ class PacedRobot:
         """Return the simulated time; it begins with that of the computer, and never runs ahead of it."""
         return self._vehicle.now_ns
 
-    def connect(self, session: Session, take: Callable[[MotionSample], None]) -> tuple[list[Stream[Frame]], DriveLink]:
+    def connect(self, session: Session, motion: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink]:
         """Return one source of both cameras, which advances the time, and the link to the controller."""
         graph, self._report = session.graph, session.warn
         session.with_obstacles_known(session.config.controller)  # which warns where there are none
         graph.telemetry.add(self._ticks)
-        return [graph.source("cameras", lambda: self._frames(graph.settle, take), wake=self.close)], self
+        session.parts[SIMULATION] = self.stats
+        return [graph.source("cameras", lambda: self._frames(graph.settle, motion), wake=self.close)], self
 
     def stats(self) -> dict[str, Any]:
         """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
@@ -106,7 +110,7 @@ class PacedRobot:
         while (command := self._commands.get()) is not None:
             yield command
 
-    def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:
+    def _frames(self, settle: Callable[[], None], motion: MotionInbox) -> Iterator[Frame]:
         """Advance from pair to pair; settle: returns when the daemon has answered."""
         vehicle, due_ns, period_ns = self._vehicle, 0, round(NS_PER_S / self._vehicle.robot.rate_hz)
         try:
@@ -114,7 +118,7 @@ class PacedRobot:
                 self.truth[pair.stamp_ns] = vehicle.base.pose
                 for sample in pair.samples:
                     if (self._motion.imu if isinstance(sample, GyroSample) else self._motion.wheels) != "off":
-                        take(sample)
+                        motion.add(sample)
                 # Images are not given before their time; a pair that comes late is not made up for.
                 sleep_until(due_ns, lambda: self._closed)
                 if self._closed:

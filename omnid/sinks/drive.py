@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -27,7 +26,7 @@ from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, OdometryUpdate
 from omnid.tracking_state import TrackingState
-from omnid.transport.topics import Answer
+from omnid.transport.topics import Answer, Answers
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
 NO_MOTOR: Final = (
@@ -50,20 +49,19 @@ class LiveDrive:
         self._link.end()
 
 
-class PlannerDrive:
-    """Pass on the setpoints of the navigation, which a source of higher priority keeps out, and its answers."""
+def planner_setpoint(update: NavigationUpdate) -> TimedSetpoint | None:
+    """Return the setpoint of the navigation as of now, which a source of higher priority keeps out."""
+    if update.setpoint is None:
+        return None
+    return TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER)
 
-    def __init__(self, link: DriveLink, answer: Callable[[int, Answer], object]) -> None:
-        """answer: takes the id of a request and never waits; a second call for an id does nothing."""
-        self._link, self._answer = link, answer
 
-    def process(self, update: NavigationUpdate) -> None:
-        """Send a setpoint, if there is one, and the answers."""
-        if update.setpoint is not None:
-            self._link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
-        for answer in update.answers:
-            state = f"{update.state}: {update.reason}" if update.reason else str(update.state)
-            self._answer(answer.id, Answer(not answer.refusal, answer.refusal or f"{answer.request}: {state}"))
+def navigation_answers(update: NavigationUpdate) -> Answers | None:
+    """Return the answer to the newest request to the navigation; to give one again does nothing."""
+    if update.answer is None:
+        return None
+    refusal, state = update.answer.refusal, f"{update.state}: {update.reason}" if update.reason else str(update.state)
+    return {update.answer.id: Answer(not refusal, refusal or f"{update.answer.request}: {state}")}
 
 
 class ReplayDrive:

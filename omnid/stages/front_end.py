@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.fit.rig_uncertainty import motion_errors
-from omnid.config import Config, OdometryConfig
+from omnid.config import Config
 from omnid.core.control.motion_monitor import AGREE, Conflict
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.line_times import RawImage
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET
@@ -39,10 +38,10 @@ Array = NDArray[np.float64]
 
 
 class FrontEnd:
-    """The stages from images to their pose, with the settings of one configuration.
+    """The stages from images to their pose: `pairing`, `dewarp`, and this one, which estimates poses from panoramas.
 
-    A run has `pairing`, `dewarp` and `odometry` as stages; `process` does the work of the last two. `dense` computes
-    the dense depth of their pairs for all stages that need it.
+    Poses are in odom, which is the rig frame of the first pair, by a rig that is checked: the first pairs, and those
+    after a loss, are checked by `health`. `dense` computes the dense depth of the pairs for all stages that need it.
     """
 
     def __init__(self, geometry: Geometry, config: Config, health: RigHealth | None = None) -> None:
@@ -52,56 +51,6 @@ class FrontEnd:
         self.pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
         self.dewarp = Dewarp(geometry, config.panorama)
         self.dense = DenseDepths(geometry, config.stereo_settings())
-        self.odometry = OdometryStage(geometry, config.odometry, self.dense, self.dewarp.raw_images, self.health)
-
-    def process(self, pair: FramePair) -> OdometryUpdate:
-        """Return the pose at a pair."""
-        return self.odometry.process(self.dewarp.process(pair))
-
-    def motion_stats(self) -> dict[str, object]:
-        """Return samples of wheels and gyro, their estimated errors with sigmas, and the sensor that differs."""
-        inbox, sensors, conflict = self.pairing.motion, self.odometry.motion, self.odometry.conflict
-        # 1. What is wrong.
-        warning = f"{conflict.reason} {conflict.detail}".strip()
-        if not sensors.wheels_are_sane:
-            what = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
-            warning = f"{what}: {conflict.detail}" if conflict.detail else what
-        elif sensors.is_slipping:
-            warning = "wheels slip"
-        # 2. The numbers.
-        stats: dict[str, object] = {
-            "wheel_samples": inbox.wheels,
-            "gyro_samples": inbox.gyro,
-            "dropped": inbox.dropped,
-            "slips": sensors.slips,
-            "refused_gyro": sensors.refused,
-            "_warning": warning,
-        }
-        wheels = {"wheel_scale": DISTANCE, "turn_scale": TURN, "wheel_offset_s": WHEEL_OFFSET}
-        gyro = {"gyro_offset_s": GYRO_OFFSET}
-        gyro |= {f"gyro_bias_{axis}_radps": BIAS.start + k for k, axis in enumerate("xyz")}
-        for states, count in ((wheels, inbox.wheels), (gyro, inbox.gyro)):
-            for name, state in states.items() if count and sensors.steps else ():
-                stats[name], stats[f"{name}_sigma"] = float(sensors.values[state]), float(sensors.sigmas[state])
-        return stats
-
-
-class OdometryStage:
-    """Estimate poses in odom, which is the rig frame of the first pair, by a rig that is checked.
-
-    The first pairs, and those after a loss, are checked by `health`.
-    """
-
-    def __init__(
-        self,
-        geometry: Geometry,
-        config: OdometryConfig,
-        dense: DenseDepths,
-        raw_images: tuple[RawImage, RawImage],
-        health: RigHealth,
-    ) -> None:
-        """dense: computes the depth of keyframes. raw_images: see VisualOdometry."""
-        self._dense, self._health = dense, health
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
@@ -111,14 +60,15 @@ class OdometryStage:
         self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, if its pose was known well
         self.motion = MotionFilter(T_base_rect=self._T_base_rect)
         self._method: VisualOdometry | PaperOdometry
-        model = geometry.model(config.noise_px)
-        if config.method == "default":
-            relocaliser = Relocaliser(model)
-            self._method = VisualOdometry(model, config.klt, config.limits, relocaliser, raw_images, self.motion)
+        settings = config.odometry
+        model = geometry.model(settings.noise_px)
+        if settings.method == "default":
+            of_images = Relocaliser(model), self.dewarp.raw_images
+            self._method = VisualOdometry(model, settings.klt, settings.limits, *of_images, self.motion)
         else:
             from omnid.core.odometry.paper.paper_odometry import PaperOdometry
 
-            self._method = PaperOdometry(model, config.klt, config.tracker, config.reference)
+            self._method = PaperOdometry(model, settings.klt, settings.tracker, settings.reference)
         self._agreement = MotionAgreement(self.motion)
         self.last_fault = AGREE  # the last disagreement that was more than a doubt
         self._contradiction = Contradiction()
@@ -140,10 +90,10 @@ class OdometryStage:
         # 1. Check the rig by the pair; where the pixels were exposed at several times, by the pair before: the odometry
         #    has found the motion during its exposures.
         if pair.times.is_at_once:
-            self._health.begin(pair)
+            self.health.begin(pair)
         elif self._unchecked is not None:
-            self._health.begin(self._unchecked.panoramas, self._unchecked.exposure)
-        is_contradicted, is_checking = self._health.state.is_contradicted, self._health.is_checking
+            self.health.begin(self._unchecked.panoramas, self._unchecked.exposure)
+        is_contradicted, is_checking = self.health.state.is_contradicted, self.health.is_checking
         # 2. What wheels and gyro have measured since the pair before.
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
         sensors = self.motion.sensors
@@ -180,12 +130,43 @@ class OdometryStage:
         self._unchecked = update.depth if is_checking and not pair.times.is_at_once else None
         self._was_found |= estimate.state is TrackingState.TRACKING
         if self._was_found and state is TrackingState.LOST:
-            self._health.check_again()
+            self.health.check_again()
         return update
 
     def complete(self) -> None:
         """Finish the work for the last pair now, such as its keyframe; otherwise that is done before the next pair."""
         self._method.complete()
+
+    def pose(self, pair: FramePair) -> OdometryUpdate:
+        """Return the pose at a pair of images: `dewarp` and `process`, for callers without a graph."""
+        return self.process(self.dewarp.process(pair))
+
+    def motion_stats(self) -> dict[str, object]:
+        """Return samples of wheels and gyro, their estimated errors with sigmas, and the sensor that differs."""
+        inbox, sensors, conflict = self.pairing.motion, self.motion, self.conflict
+        # 1. What is wrong.
+        warning = f"{conflict.reason} {conflict.detail}".strip()
+        if not sensors.wheels_are_sane:
+            what = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
+            warning = f"{what}: {conflict.detail}" if conflict.detail else what
+        elif sensors.is_slipping:
+            warning = "wheels slip"
+        # 2. The numbers.
+        stats: dict[str, object] = {
+            "wheel_samples": inbox.wheels,
+            "gyro_samples": inbox.gyro,
+            "dropped": inbox.dropped,
+            "slips": sensors.slips,
+            "refused_gyro": sensors.refused,
+            "_warning": warning,
+        }
+        wheels = {"wheel_scale": DISTANCE, "turn_scale": TURN, "wheel_offset_s": WHEEL_OFFSET}
+        gyro = {"gyro_offset_s": GYRO_OFFSET}
+        gyro |= {f"gyro_bias_{axis}_radps": BIAS.start + k for k, axis in enumerate("xyz")}
+        for states, count in ((wheels, inbox.wheels), (gyro, inbox.gyro)):
+            for name, state in states.items() if count and sensors.steps else ():
+                stats[name], stats[f"{name}_sigma"] = float(sensors.values[state]), float(sensors.sigmas[state])
+        return stats
 
     def _update(self, pair: Panoramas, estimate: OdometryEstimate, state: TrackingState) -> OdometryUpdate:
         """Return the message of an estimate, in the frame of the rig, with the errors of rig and sensors."""
@@ -226,7 +207,7 @@ class OdometryStage:
 
     def _disparity(self, pair: Panoramas, exposure: Exposure | None) -> NDArray[np.float32]:
         """Return the disparities (H, W) of a pair for a motion during its exposures."""
-        return self._dense.points(pair, _moving(exposure)).disparity
+        return self.dense.points(pair, _moving(exposure)).disparity
 
 
 def _moving(exposure: Exposure | None) -> Exposure | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import TypeAlias
 
 import numpy as np
@@ -27,9 +26,8 @@ from omnid.core.navigation.requests import (
     RouteRequest,
     TaughtRoute,
     may_begin_motion,
-    stops_motion,
 )
-from omnid.core.navigation.route import ENTRY_M, KeyframePose, RouteRecorder, repeated_paths
+from omnid.core.navigation.route import ENTRY_M, KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_of_map, refusal_to_drive
 from omnid.core.navigation.surroundings import Surroundings, near_ends
@@ -44,20 +42,19 @@ from omnid.messages import (
     RequestAnswer,
 )
 from omnid.tracking_state import MapState
-from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | WheelState | NavigationCommand
 
 REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
 SCAN_NS = 2_000_000_000  # older scans show nothing of now: the collision monitor then stops the base
-OVERTAKEN = "a later request has ended it: ask again"
 
 
 class NavigationStage:
     """Drive to goals, along paths and routes, and record routes. Its frames are those of the base, as on the bus.
 
-    Routes are tied to the keyframes of the map of places, as the newest update has them; others read and write files.
+    Routes are tied to the keyframes of the map of places, as the newest update has them. All routes are in memory, so
+    that no request waits for a disk; another stage writes those that were taught.
     """
 
     def __init__(
@@ -67,16 +64,18 @@ class NavigationStage:
         T_base_rig: Array,
         T_base_rect: Array,
         map_name: str,
+        routes: dict[str, Route],
         *,
         is_new: bool,
     ) -> None:
         """collision: the outline of the base. map_name: of the map's file; empty: the map is not saved, so no route can
-        be tied to it. is_new: the map was empty before this run, and its frame is odom at the start.
+        be tied to it. routes: by their names; a route that was taught is added. is_new: the map was empty before this
+        run, and its frame is odom at the start.
         """
         self._settings, self._collision, self._T_base_rig = settings, collision, T_base_rig
         self._T_rig_base = se3.inverse(T_base_rig)
         self._T_base_rect, self._T_rect_base = T_base_rect, se3.inverse(T_base_rect)
-        self.map_name, self._is_new = map_name, is_new
+        self.map_name, self._routes, self._is_new = map_name, routes, is_new
         self._wheels = WheelState(False, False)
         self._navigator = Navigator(settings, collision)
         self._now: Situation | None = None
@@ -87,15 +86,10 @@ class NavigationStage:
         self._scan: ObstacleScan | None = None
         self._around: Surroundings | None = None  # by the newest scan that was used
         self._recorder: RouteRecorder | None = None  # of the route that is taught
-        self._finished: RouteRecorder | None = None  # of the last one, which is written again where that has failed
         self._taught: TaughtRoute | None = None  # the last one
         self._taught_resets = 0  # resets of odometry when the recording began
         self._seq = 0
-        # Ids of the newest request to halt, and of that which began the newest drive: a request that waited for a file
-        # may come after later ones.
-        self._halted = self._begun = 0
-        # An update repeats as many answers as requests may wait: a sink may miss updates.
-        self._answers: deque[RequestAnswer] = deque(maxlen=MOST_OPEN)
+        self._answer: RequestAnswer | None = None  # to the newest request
         self._plan: NavigationPlan | None = None  # plan that is not yet part of a message
         self._given: tuple[object, ...] = ()  # the state that was given last
         self._given_ns = -REPEAT_NS
@@ -170,7 +164,7 @@ class NavigationStage:
         except OmnidError as error:
             refusal = str(error)
         if self._taught is taught:
-            self._answers.append(RequestAnswer(command.id, word, refusal))
+            self._answer = RequestAnswer(command.id, word, refusal)
         setpoint = STAND if navigator.stopping else None
         update = self._update(Navigation(setpoint, navigator.state, navigator.reason), always=True)
         assert update is not None
@@ -179,20 +173,8 @@ class NavigationStage:
     def _execute(self, command: NavigationCommand) -> None:
         """Execute a request. Raise OmnidError with the reason to refuse it."""
         request, navigator = command.request, self._navigator
-        # 1. What overtakes it, as it has waited for a file, and a stop of the wheels since then.
-        if stops_motion(request):
-            self._halted = max(self._halted, command.id)
-        elif 0 < command.id < self._halted:
-            raise OmnidError(OVERTAKEN)
-        else:
-            _raise_if(command.refusal)
-        if may_begin_motion(request):
-            _raise_if(command.void)
-            if command.stop_count < self._wheels.stop_count:
-                raise OmnidError("a stop or a fault has come since: ask again")
-            if 0 < command.id < self._begun:
-                raise OmnidError(OVERTAKEN)
-        # 2. What it asks for.
+        if may_begin_motion(request) and command.stop_count < self._wheels.stop_count:
+            raise OmnidError("a stop or a fault has come since: ask again")
         match request:
             case NavigationVerb.CANCEL:
                 navigator.cancel("by a request")
@@ -217,7 +199,6 @@ class NavigationStage:
 
     def _start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], command: NavigationCommand) -> None:
         self._navigator.start(task, frame, paths, self._situation(), command.stamp_ns)
-        self._begun = max(self._begun, command.id)
         xy = np.vstack([leg.xy for leg in paths[0].legs])
         self._plan = NavigationPlan(frame, xy, paths[0].final_heading_rad)
 
@@ -241,15 +222,16 @@ class NavigationStage:
         """Return the paths of a repetition."""
         self._require_map()
         self._require_no_teaching()
-        if request.route is None:
-            raise OmnidError(f"the route {request.name} was not read")
-        if not request.route.fits(self._keyframe):
+        route = self._routes.get(request.name)
+        if route is None:
+            raise OmnidError(f"there is no route {request.name}; routes: {', '.join(self._routes) or 'none'}")
+        if not route.fits(self._keyframe):
             raise OmnidError(
-                f"the route {request.name} was taught in the map {request.route.map_name} as it was then: start with "
+                f"the route {request.name} was taught in the map {route.map_name} as it was then: start with "
                 "that map (`omnid run --map`), or teach it again"
             )
         return repeated_paths(
-            request.route,
+            route,
             self._keyframe,
             self._pose_in(NavigationFrame.MAP),
             loops=request.loops,
@@ -263,6 +245,9 @@ class NavigationStage:
             raise OmnidError("a route is being repeated: stop it first")
         self._require_map()
         self._require_no_teaching()
+        if request.name in self._routes and not request.replace:
+            again = f"choose another name, or replace it (`omnid route teach {request.name} --replace`)"
+            raise OmnidError(f"there is a route {request.name} already: {again}")
         now = self._situation()
         refusal = refusal_of_map(now, math.inf)
         if not (self._is_new and now.resets == 0 and now.in_map is not None):
@@ -283,17 +268,20 @@ class NavigationStage:
             recorder.add(now.pose_in(NavigationFrame.MAP), now.speed_mps, *tie)
         except OmnidError as error:
             self._recorder = None
-            self._answers.append(RequestAnswer(0, "teach", str(error)))
+            self._answer = RequestAnswer(0, "teach", str(error))
 
     def _finish(self, command: NavigationCommand) -> None:
         """Have the recorded route written; asked for again, the last one is written again, as a disk may be full."""
-        recorder = self._recorder or self._finished
-        if recorder is None:
-            raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
         self._require_map()
-        created_s = command.arrival_ns // NS_PER_S
-        route = recorder.route(self._keyframe, self.keyframes.stamps_ns, created_s, self.map_name)
-        self._taught, self._finished, self._recorder = TaughtRoute(route, command.id), recorder, None
+        if self._recorder is not None:
+            created_s = command.arrival_ns // NS_PER_S
+            route = self._recorder.route(self._keyframe, self.keyframes.stamps_ns, created_s, self.map_name)
+            self._recorder, self._routes[route.name] = None, route
+        elif self._taught is not None:
+            route = self._taught.route
+        else:
+            raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
+        self._taught = TaughtRoute(route, command.id)
 
     def _keyframe(self, id: int) -> KeyframePose | None:
         """Return a keyframe of the map, None without one."""
@@ -329,11 +317,11 @@ class NavigationStage:
         return self._now._replace(in_map=self._in_map, wheels=self._wheels)
 
     def _update(self, now: Navigation, *, always: bool = False) -> NavigationUpdate | None:
-        navigator, answers, recorder = self._navigator, tuple(self._answers), self._recorder
+        navigator, answer, recorder = self._navigator, self._answer, self._recorder
         stamp_ns = 0 if self._now is None else self._now.stamp_ns
         plan, self._plan = self._plan, None
         teaching = recorder.name if recorder else ""
-        state = (now.state, now.reason, navigator.task, teaching, self._taught, answers)
+        state = (now.state, now.reason, navigator.task, teaching, self._taught, answer)
         same = state == self._given and now.setpoint is None and plan is None
         if same and not always and stamp_ns - self._given_ns < REPEAT_NS:
             return None
@@ -353,7 +341,7 @@ class NavigationStage:
             teaching,
             recorder.length_m if recorder else 0.0,
             self._taught,
-            answers,
+            answer,
             plan,
         )
 

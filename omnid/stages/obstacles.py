@@ -23,7 +23,6 @@ from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.posterior import thin_things_m
 from omnid.core.obstacles.ray_scans import RayScans
-from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.stereo.tiles import tile_columns
 from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
 from omnid.stages.dense_depths import DenseDepths
@@ -109,18 +108,35 @@ def sectors_of(tiles: Flags, cylinder: Cylinder, T_base_rect: Array, ranges_m: S
     return found
 
 
-class PairScans:
-    """The obstacle grid of a run, the obstacles that move in it, and its scan at each pair that is added."""
+class Obstacles:
+    """Makes a scan of each pair that is due: the obstacle grid of a run, and the obstacles that move in it."""
 
-    def __init__(self, geometry: Geometry, settings: ScanSettings) -> None:
-        self._geometry = geometry
+    def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths) -> None:
+        """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""
+        self._geometry, self._dense = geometry, dense
+        self._period_ns = NS_PER_S / config.rate_hz if config.rate_hz else 0.0
+        self.floor = CameraFloor(geometry.rig, config.scan.floor_m)
         self._of_floor: Floor | None = None  # for which the tables of the scans were made
-        self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, settings)
+        self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, config.scan)
         self._tracker = MovingTracker()
         self._T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
+        self._last_ns: int | None = None
         self._resets = 0
 
-    def add(self, odometry: OdometryUpdate, camera_floor: CameraFloor) -> ObstacleScan:
+    def process(self, odometry: OdometryUpdate) -> ObstacleScan | None:
+        """Return the scan at a pair, None where it is not due."""
+        # 1. At the rate of the configuration; stamps that step back are of another part of a log.
+        if self._last_ns is not None and 0 <= odometry.stamp_ns - self._last_ns < self._period_ns - STAMP_JITTER_NS:
+            return None
+        self._last_ns = odometry.stamp_ns
+        # 2. The floor, from points of pairs whose pose is known, until it is known.
+        if self.floor.wants_points and odometry.state is not TrackingState.LOST:
+            # As they were matched: the fit leaves out by itself what is no floor.
+            self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
+        # 3. The scan.
+        return self.scan(odometry)
+
+    def scan(self, odometry: OdometryUpdate) -> ObstacleScan:
         """Add the evidence of a pair; return the scan at it, which is unknown while the floor or the pose is."""
         # 1. Forget the grid and the tracks where odometry has begun again; while it is lost the grid stays: it holds
         #    again once odometry recognises its landmarks.
@@ -136,12 +152,12 @@ class PairScans:
         unwatched = sectors_of(tiles.unknown, *of_base, UNWATCHED_M)
         unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         # 2. Tables of the floor.
-        floor = camera_floor.floor
+        floor = self.floor.floor
         if is_lost or floor is None:
             return unknown
         if floor is not self._of_floor:
             self._of_floor = floor
-            T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
+            T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(self.floor.T_floor_rig(floor))
             self.scans.set_floor(T_rect_floor, panoramas.visible)
         # 3. The scan by the images, without their dead and blind parts.
         lost = tiles.lost_pixels(panoramas.visible.shape)
@@ -170,31 +186,6 @@ class PairScans:
         """
         belief = self.scans.belief
         return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief)
-
-
-class Obstacles:
-    """Makes a scan of each pair that is due, from the evidence of its columns."""
-
-    def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths) -> None:
-        """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""
-        self._dense = dense
-        self._period_ns = NS_PER_S / config.rate_hz if config.rate_hz else 0.0
-        self.floor = CameraFloor(geometry.rig, config.scan.floor_m)
-        self._scans = PairScans(geometry, config.scan)
-        self._last_ns: int | None = None
-
-    def process(self, odometry: OdometryUpdate) -> ObstacleScan | None:
-        """Return the scan at a pair, None where it is not due."""
-        # 1. At the rate of the configuration; stamps that step back are of another part of a log.
-        if self._last_ns is not None and 0 <= odometry.stamp_ns - self._last_ns < self._period_ns - STAMP_JITTER_NS:
-            return None
-        self._last_ns = odometry.stamp_ns
-        # 2. The floor, from points of pairs whose pose is known, until it is known.
-        if self.floor.wants_points and odometry.state is not TrackingState.LOST:
-            # As they were matched: the fit leaves out by itself what is no floor.
-            self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
-        # 3. The scan.
-        return self._scans.add(odometry, self.floor)
 
 
 def controller_scan(scan: ObstacleScan) -> ControllerScan:

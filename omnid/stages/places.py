@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,17 +11,15 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import Config
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, FreeRanges, RangeScan, point_scan, seen_from
-from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
-from omnid.messages import DensePoints, MapCopy, MapKeyframes, ObstacleScan, OdometryUpdate, PlaceUpdate, SaveMap
+from omnid.messages import DensePoints, MapKeyframes, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
-from omnid.stages.obstacles import CameraFloor, PairScans
+from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
 
@@ -30,49 +27,31 @@ Array = NDArray[np.float64]
 class Places:
     """Localise the poses of odometry in a map of places, which grows with them.
 
-    The map belongs to the thread of this stage until the run ends. It leaves it by the copies that updates carry.
+    The map belongs to the thread of this stage until the run ends.
     """
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        config: Config,
-        dense: DenseDepths,
-        places: PlaceMap | None = None,
-        copy_s: float = 0.0,
-    ) -> None:
-        """dense: computes the depth of keyframes. places: a map to be extended, None: a new one.
-
-        copy_s: time between two copies of the map that are to be written, by the stamps; 0: none.
-        """
+    def __init__(self, geometry: Geometry, config: Config, dense: DenseDepths, places: PlaceMap | None = None) -> None:
+        """dense: computes the depth of keyframes. places: a map to be extended, None: a new one."""
         self._dense = dense
         model, settings = geometry.model(config.odometry.noise_px), config.places
         self._localiser = MapLocaliser(model, settings.limits, places, localize_only=settings.localize_only)
         self._T_rig_rect = geometry.T_rig_rect
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._limits = config.obstacles.scan
-        self._scans = PairScans(geometry, config.obstacles.scan)  # at keyframes
-        self.floor = CameraFloor(geometry.rig, config.obstacles.scan.floor_m)
+        self._obstacles = Obstacles(geometry, config.obstacles, dense)  # at keyframes
+        self.floor = self._obstacles.floor
         self.state = MapState.ODOMETRY_ONLY  # state of the newest pose
         self.counts = self._localiser.counts  # sizes and counters of the map
         self._shown: object = None  # scans of the map when these were counted and its keyframes were copied
         self._keyframes: MapKeyframes | None = None
-        self._copy_ns, self._copied_ns = round(copy_s * NS_PER_S), 0
-        self._copy_wanted = False
-        self._copy: MapCopy | None = None
-        self._asked: deque[int] = deque(maxlen=MOST_OPEN)  # ids of requests for a copy: a sink may miss updates
 
     def map(self) -> PlaceMap:
         """Return the places whose poses are known relative to the first one: what can be saved."""
         return self._localiser.map()
 
-    def process(self, message: OdometryUpdate | SaveMap) -> PlaceUpdate | None:
-        """Return the pose in the map at a pair. A request to save the map has the next one carry a copy."""
-        if isinstance(message, SaveMap):
-            self._copy_wanted = True
-            self._asked.append(message.id)
-            return None
-        odometry, places = message, self._localiser.places
+    def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
+        """Return the pose in the map at a pair."""
+        places = self._localiser.places
         # 1. The pose in the map.
         pose = self._localiser.process(self._frame(odometry))
         self.state = pose.state
@@ -83,10 +62,6 @@ class Places:
             stamps_ns = {id: places.keyframes[id].stamp_ns for id in ids}
             self._keyframes = MapKeyframes(stamps_ns, {id: places.poses[id] for id in ids})
             self._shown, self.counts = scans, self._localiser.counts
-        self._copied_ns = self._copied_ns or odometry.stamp_ns
-        if self._copy_wanted or (self._copy_ns and odometry.stamp_ns - self._copied_ns >= self._copy_ns):
-            self._copy_wanted, self._copied_ns = False, odometry.stamp_ns
-            self._copy = MapCopy(places.part(places.keyframes), tuple(self._asked))
         # 3. The message, in the frame of the rig.
         T_map_odom, to_rig = self._in_rig(pose.T_map_odom), se3.adjoint(self._T_rig_rect)
         return PlaceUpdate(
@@ -101,7 +76,6 @@ class Places:
             scans,
             self._keyframes,
             pose.is_known,
-            self._copy,
         )
 
     def stats(self) -> dict[str, object]:
@@ -147,8 +121,8 @@ class Places:
         """Return the range scan of a pair, and up to where floor was seen."""
         dense = self._dense.of(odometry.depth)
         self.floor.add(dense)
-        scan = self._scans.add(odometry, self.floor)
-        return keyframe_ranges(dense, scan, self._scans.thin_m, self.floor, self._T_rig_rect, self._limits)
+        scan = self._obstacles.scan(odometry)
+        return keyframe_ranges(dense, scan, self._obstacles.thin_m, self.floor, self._T_rig_rect, self._limits)
 
 
 def keyframe_ranges(

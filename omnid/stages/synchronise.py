@@ -72,24 +72,21 @@ class Decoder:
         """
         try:
             image = gray(frame)
+            found, expected = image.shape[::-1], self._sizes[frame.camera]
+            if found == expected:
+                self._fitted.add(frame.camera)
+                return image
+            fault = f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before"
+            if frame.camera not in self._fitted:
+                raise OmnidError(
+                    f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
+                    f"{expected[1]} px: it is that of other cameras; name the rig.toml of these, or calibrate them"
+                )
         except FrameDecodeError as error:
-            self._skip(str(error))
-            return None
-        found, expected = image.shape[::-1], self._sizes[frame.camera]
-        if found == expected:
-            self._fitted.add(frame.camera)
-            return image
-        if frame.camera not in self._fitted:
-            raise OmnidError(
-                f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
-                f"{expected[1]} px: it is that of other cameras; name the rig.toml of these, or calibrate them"
-            )
-        self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")
-        return None
-
-    def _skip(self, fault: str) -> None:
+            fault = str(error)
         self.broken += 1
         self.fault = self.fault or fault
+        return None
 
 
 class MotionInbox:
@@ -150,14 +147,6 @@ class _Camera:
         """Median of the recent steps; NaN before the second image."""
         return float(median_low(self.steps_ns)) if self.steps_ns else math.nan
 
-    def arrive(self, frame: Frame) -> None:
-        """Let a frame wait for a partner."""
-        if self.newest_ns and frame.stamp_ns > self.newest_ns:
-            self.steps_ns.append(frame.stamp_ns - self.newest_ns)
-        self.newest_ns = frame.stamp_ns
-        self.arrived += 1
-        self.waiting.append(frame)
-
     def drop_until(self, count: int) -> None:
         """Give up the oldest frames, which have found no partner, until this number waits."""
         while len(self.waiting) > count:
@@ -196,11 +185,9 @@ class Synchronise:
 
     def __init__(self, rig: Rig, config: PairConfig, R_base_imu: NDArray[np.float64] | None = None) -> None:
         """R_base_imu: rotation from the axes of the gyro to those of the base; None: they are the same."""
-        self._decode = Decoder(rig)
+        self._config, self._decode = config, Decoder(rig)
         self._cameras: dict[Camera, _Camera] = {name: _Camera() for name in CAMERAS}
-        self._fixed_ns = round(config.tolerance_ms * 1e6)  # 0: none
         self._pairs = 0
-        self._use_repeated = config.repeated_images == "use"
         self.skew = Skew()
         self.motion = MotionInbox(R_base_imu)
 
@@ -237,27 +224,38 @@ class Synchronise:
         slower_ns = max(lower.period_ns, upper.period_ns)
         return max(camera.arrived * camera.period_ns / slower_ns for camera in (lower, upper))
 
+    @property
+    def _tolerance_ns(self) -> float:
+        periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.steps_ns]
+        # Before the period is known, only what the scatter of the stamps explains.
+        return round(self._config.tolerance_ms * 1e6) or min(periods_ns, default=8 * STAMP_SIGMA_NS) / 2
+
     def process(self, message: Frame | MotionSample) -> FramePair | None:
         """Return the pair that a frame completes; None where the frame waits, is broken or shows nothing new."""
         if not isinstance(message, Frame):
             self.motion.add(message)
             return None
         # 1. The frame waits for a partner.
-        self._cameras[message.camera].arrive(message)
+        camera = self._cameras[message.camera]
+        if camera.newest_ns and message.stamp_ns > camera.newest_ns:
+            camera.steps_ns.append(message.stamp_ns - camera.newest_ns)
+        camera.newest_ns = message.stamp_ns
+        camera.arrived += 1
+        camera.waiting.append(message)
         # 2. The two frames that are nearest in time make a pair, unless one of them is broken.
-        lower, upper = self._cameras.values()
+        lower, upper = cameras = tuple(self._cameras.values())
         while lower.waiting and upper.waiting:
             frames = min(product(lower.waiting, upper.waiting), key=_gap_ns)
             if _gap_ns(frames) > self._tolerance_ns:
                 break
             images = [self._decode(frame) for frame in frames]
-            for camera, frame, image in zip((lower, upper), frames, images, strict=True):
+            for one, frame, image in zip(cameras, frames, images, strict=True):
                 if image is None:
-                    camera.waiting.remove(frame)
+                    one.waiting.remove(frame)
             if images[0] is not None and images[1] is not None:
                 return self._joined(frames, (images[0], images[1]))
         # 3. Only a few wait.
-        self._cameras[message.camera].drop_until(MAX_WAITING)
+        camera.drop_until(MAX_WAITING)
         return None
 
     def finish(self) -> tuple[()]:
@@ -265,12 +263,6 @@ class Synchronise:
         for camera in self._cameras.values():
             camera.drop_until(0)
         return ()
-
-    @property
-    def _tolerance_ns(self) -> float:
-        periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.steps_ns]
-        # Before the period is known, only what the scatter of the stamps explains.
-        return self._fixed_ns or min(periods_ns, default=8 * STAMP_SIGMA_NS) / 2
 
     def _joined(self, frames: tuple[Frame, Frame], images: tuple[Image, Image]) -> FramePair | None:
         # 1. Frames that waited before these can match no later one: they are given up.
@@ -281,7 +273,7 @@ class Synchronise:
         lower, upper = frames
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
         repeated = [camera.repeats(image) for camera, image in zip(self._cameras.values(), images, strict=True)]
-        if any(repeated) and not self._use_repeated:
+        if any(repeated) and self._config.repeated_images != "use":
             return None
         # 3. The pair.
         self._pairs += 1

@@ -138,7 +138,7 @@ class Bus:
         self._session = session = open_session(config)
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._namesakes: set[str] = set()  # liveliness tokens of other robots of this name
-        self._on_command: Callable[[Request], object] = lambda _: None
+        self._on_command: Callable[[Request], Answer | None] = lambda _: None
         self._watch_for_namesakes()
         # A robot whose time is the computer's has none: programs that wait for it would believe to be in a simulation.
         topics = [name for name in PUBLISHED if gives_time or name != CLOCK]
@@ -194,12 +194,13 @@ class Bus:
 
     def subscribe_commands(
         self,
-        callback: Callable[[Request], None],
+        callback: Callable[[Request], Answer | None],
         topics: Mapping[str, str],
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """Call callback for messages on `<robot>/cmd/...` and queries that ask the same, in a thread of the bus.
 
+        It returns the answer, None where another part of the robot answers later or none is needed.
         topics: with their types, each with a budget of its own; what exceeds it is dropped and counted.
         is_stopped: True if a stop holds, which confirms stops that come as datagrams; they are passed on as others.
         """
@@ -327,4 +328,5 @@ class Bus:
                 self._open.pop(min(self._open.copy()), None)
         elif message.source_info is not None:
             sender = str(message.source_info.source_id.zid)
-        self._on_command(Request(topic, payload, sender, sent_ns, id, echo_ns))
+        if (answer := self._on_command(Request(topic, payload, sender, sent_ns, id, echo_ns))) is not None:
+            self.answer(id, answer)

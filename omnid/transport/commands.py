@@ -248,7 +248,7 @@ class CommandReceiver:
             self._freshness.require(message, arrival_ns, stamp_ns)
         self.requests.accepted += 1
         stamp_ns = stamp_ns or message.sent_ns
-        navigate(requests.NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=arrival_ns))
+        navigate(requests.NavigationCommand(request, time.time_ns(), stamp_ns, message.id))
 
     def _save(self, save_map: Callable[[int], object], request: Request, _: int) -> None:
         if codec.string_from_cdr(request.payload) != topics.SAVE_MAP:

@@ -39,7 +39,7 @@ def addresses(endpoints: Sequence[str]) -> Iterator[tuple[str, int]]:
 class StopListener:
     """The daemon's end. An address that is in use is left out: stops by the bus are as before."""
 
-    def __init__(self, config: BusConfig, on_stop: Callable[[], None], is_stopped: Callable[[], bool]) -> None:
+    def __init__(self, config: BusConfig, on_stop: Callable[[], object], is_stopped: Callable[[], bool]) -> None:
         """on_stop: called for each request. is_stopped: True if the robot is disarmed by a stop."""
         self._robot, self._on_stop, self._is_stopped = config.robot.encode(), on_stop, is_stopped
         self._longest = 2 * len(_request(config.robot))  # bytes that are read of a datagram, so that a tail is seen

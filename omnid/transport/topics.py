@@ -12,7 +12,7 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from omnid.transport import codec
 from omnid.transport.status_names import decode_navigation
@@ -162,6 +162,9 @@ class Answer(NamedTuple):
 
     done: bool
     text: str  # what was done, or why not with the remedy
+
+
+Answers: TypeAlias = dict[int, Answer]  # by the ids of the requests
 
 
 def answer_of(payload: bytes) -> Answer | None:

@@ -26,11 +26,11 @@ from omnid.engine.graph import Graph, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
-from omnid.runs.place_maps import RunPlaces
+from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.dewarp import Dewarp
-from omnid.stages.front_end import FrontEnd, OdometryStage
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.mapping import Mapping
 from omnid.stages.synchronise import Synchronise
@@ -43,7 +43,7 @@ SKIPPED: Final = 10  # first pairs, in which caches, buffers and the first map a
 STAGES: Final[dict[str, type]] = {
     "pair": Synchronise,
     "dewarp": Dewarp,
-    "odometry": OdometryStage,
+    "odometry": FrontEnd,
     "dense stereo and mapping": Mapping,
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -85,14 +84,13 @@ def test_what_is_not_recognised_is_left_out_with_a_warning(
 ) -> None:
     """No pose in the map is written, and no transform from it, as neither could say that the robot may be anywhere."""
     before, log = omap.read_bytes(), tmp_path / "out.mcap"
-    files = ("--map-tum", tmp_path / "m", "--map-live-tum", tmp_path / "l", "--record", log)
-    for path in (tmp_path / "m", tmp_path / "l"):
-        path.write_text("1 0 0 0 0 0 0 1")  # of an earlier run
+    files = ("--map-tum", tmp_path / "m", "--record", log)
+    (tmp_path / "m").write_text("1 0 0 0 0 0 0 1")  # of an earlier run
     result = omnid.replay(elsewhere / "log.mcap", "--map", omap, *files, rig=scene / "rig.toml")
     assert result.code == 0 and result.count("loops") == 0
     assert f"{omap}: no place of it was recognised" in result.err and omap.read_bytes() == before
-    assert not (tmp_path / "m").read_bytes() and not (tmp_path / "l").read_bytes()
-    assert result.err.count("poses are left out") == 2
+    assert not (tmp_path / "m").read_bytes()
+    assert result.err.count("poses are left out") == 1
     with log.open("rb") as file:
         topics = [channel.topic for _, channel, message in make_reader(file).iter_messages() if b"map" in message.data]
     assert "/omnid/map_pose" in topics and "/tf" not in topics and "/omnid/map" not in topics
@@ -167,24 +165,14 @@ def test_the_trajectory_in_the_map_is_better_and_the_same_threaded_and_inline(
 ) -> None:
     for name, more in (("a", ["--record", tmp_path / "out.mcap"]), ("b", ["--inline"])):
         files = ("--tum", tmp_path / f"{name}.odom", "--map-tum", tmp_path / name, *more)
-        files = (*files, "--map-live-tum", tmp_path / f"{name}.live")
         result = omnid.replay(drive / "log.mcap", *files, "--set", "rig.check=off", rig=drive / "wrong.toml")
         assert result.code == 0 and result.count("loops") >= 3
-    for end in ("", ".live"):
-        assert (tmp_path / f"a{end}").read_bytes() == (tmp_path / f"b{end}").read_bytes()
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     odom, in_map, truth = (read_tum(path) for path in (tmp_path / "a.odom", tmp_path / "a", drive / "truth.txt"))
     assert np.array_equal(odom.stamps_ns, in_map.stamps_ns)
     by_odometry, by_map = evaluate(odom, truth), evaluate(in_map, truth)
     assert by_odometry.end_error_m > 0.01 and by_map.end_error_m < 0.6 * by_odometry.end_error_m
     _assert_published(tmp_path / "out.mcap", odom.T)
-    # What the controller had: odometry's poses until the first place was recognised, corrected ones afterwards.
-    live = read_tum(tmp_path / "a.live")
-    np.testing.assert_allclose(live.T[:5], odom.T[:5], atol=1e-6)
-    known, by_all = (
-        json.loads(omnid("eval", tmp_path / name, drive / "truth.txt", "--json").out) for name in ("a.live", "a")
-    )
-    assert by_all["end_error_m"] == pytest.approx(by_map.end_error_m)
-    assert by_all["ate_rmse_m"] < known["ate_rmse_m"] and known["end_error_m"] < by_odometry.end_error_m
 
 
 def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:

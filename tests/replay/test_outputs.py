@@ -29,7 +29,7 @@ from omnid.formats.exports import write_ply
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
 from omnid.recordings.evaluation import evaluate
-from omnid.runs.place_maps import RunPlaces
+from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import parse
 from omnid.sinks.files import TrajectoryFile
@@ -38,10 +38,9 @@ from omnid.stages.geometry import geometry, with_rims
 from omnid.transport.codec import decode_diagnostics, decode_map, decode_pose
 from omnid.transport.status_names import ODOMETRY, WHEELS, stage_name
 from tests.conftest import PAIRS
-from tests.drivers.logs.mcap_logs import COMPRESSED, STORE, Entry, compressed, write_log
+from tests.drivers.logs.mcap_logs import STORE
 from tests.ply import read_ply
 from tests.replay.command import Command, rows
-from tests.replay.edited import images
 from tests.replay.live import recorded_run
 
 METHODS = ([], ["--method", "paper"])
@@ -152,30 +151,6 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"
-
-
-def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """Options or the rig tell which camera is which, if the names of the topics do not."""
-    topics = {"lower": "/cam0", "upper": "/cam1"}
-    entries = [
-        Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
-        for p in images(scene / "log.mcap")
-    ]
-    log = write_log(tmp_path / "log.mcap", entries)
-    assert "--lower" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
-    write_rig(tmp_path / "rig.toml", replace(read_rig(scene / "rig.toml"), topics=("/cam0", "/cam1")))
-    given = ("--lower", "/cam0", "--upper", "/cam1")
-    for name, rig, words in (("a", scene / "rig.toml", given), ("b", tmp_path / "rig.toml", ())):
-        assert omnid.replay(log, "--tum", tmp_path / name, *words, *FEW, rig=rig).code == 0
-    omnid.replay(scene / "log.mcap", "--tum", tmp_path / "c", *FEW, rig=scene / "rig.toml")
-    assert len(rows(tmp_path / "a")) == FEW_PAIRS
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() == (tmp_path / "c").read_bytes()
-
-
-def test_a_taken_port_ends_a_replay(omnid: Command, scene: Path, taken_port: int) -> None:
-    listen = f'bus.listen=["tcp/127.0.0.1:{taken_port}"]'
-    words = ("--rig", scene / "rig.toml", "--quiet", "--publish", "--set", listen)
-    assert "bus" in omnid.refused("replay", scene / "log.mcap", *words)
 
 
 def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -74,7 +74,6 @@ class RouteRequest:
     loops: int = 1
     from_start: bool = False  # the whole route; else from where the robot is on it
     replace: bool = False  # teach in the place of a route of that name
-    route: Route | None = None  # route that is to be repeated, as read from its file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,11 +94,8 @@ class NavigationCommand(NamedTuple):
     arrival_ns: int  # Unix time
     stamp_ns: int = 0  # Unix time by the sender's clock; 0: it has none
     id: int = 0  # id of the request; the answer has the same
-    refusal: str = ""  # why it is refused already, as by a file that is missing
-    void: str = ""  # why it may begin no motion any more; empty: it may
     # Stops and faults that had made cmd/arm necessary before the request: it begins no motion after a later one.
     stop_count: int = 0
-    asked_ns: int = 0  # arrival by CLOCK_MONOTONIC; 0: it may wait for its file as long as that takes
 
 
 def may_begin_motion(request: NavigationRequest) -> bool:

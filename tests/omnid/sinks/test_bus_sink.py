@@ -29,7 +29,7 @@ from omnid.engine.telemetry import StageStats
 from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
-from omnid.sinks.drive import PlannerDrive, ReplayDrive
+from omnid.sinks.drive import ReplayDrive, navigation_answers, planner_setpoint
 from omnid.sinks.encoder import Encoder, Outgoing
 from omnid.tracking_state import TrackingState
 from omnid.transport.bus import Bus, BusConfig
@@ -232,11 +232,10 @@ def test_a_pose_of_a_replay_counts_as_captured_on_arrival_and_renews_the_setpoin
     assert [arrival_ns for _, arrival_ns in link.setpoints] == [pose.stamp_ns for pose in link.poses]
 
 
-def test_the_answers_of_the_navigation_are_given(link: Any) -> None:
-    answered: list[tuple[int, Answer]] = []
-    drive = PlannerDrive(link, lambda id, answer: answered.append((id, answer)))
-    answers = (RequestAnswer(4, "pause", ""), RequestAnswer(5, "repeat lost", "no route lost"))
-    update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answers=answers)
-    drive.process(update)
-    assert answered == [(4, Answer(True, "pause: paused: by a request")), (5, Answer(False, "no route lost"))]
-    assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD]
+def test_setpoints_and_answers_of_the_navigation() -> None:
+    update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
+    refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
+    assert navigation_answers(update) == {4: Answer(True, "pause: paused: by a request")}
+    assert navigation_answers(refused) == {5: Answer(False, "no route lost")}
+    setpoint = planner_setpoint(update)
+    assert setpoint is not None and setpoint.setpoint == AHEAD and planner_setpoint(refused) is None

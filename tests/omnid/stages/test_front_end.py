@@ -19,28 +19,21 @@ from calib.rig_file import read_rig
 from drivers.frame import CAMERAS, Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.rig.column_finding import PanoramaPair
-from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph, nothing
 from omnid.formats.tum import read_tum
-from omnid.messages import FramePair, OdometryUpdate, Panoramas, SaveMap
-from omnid.runs.place_maps import RunPlaces
+from omnid.messages import FramePair, OdometryUpdate
+from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
-from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
-from tests.omnid.core.scenery import texture, wrapped
-from tests.simulation import build, make_rig, render_grey
+from tests.simulation import build, render_grey
 from tests.simulation.disturbances import DisturbedCamera
 
 CONFIG = Config()
-CHECKED = 4  # pairs
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +49,6 @@ def place(scene: Path) -> Geometry:
 @pytest.fixture(scope="module")
 def pairs(frames: list[Frame], place: Geometry) -> list[FramePair]:
     return list(filter(None, map(Synchronise(place.rig, CONFIG.pair).process, frames)))
-
-
-@pytest.fixture(scope="module")
-def poses(place: Geometry, pairs: list[FramePair]) -> list[OdometryUpdate]:
-    front_end, found = FrontEnd(place, CONFIG), []
-    for pair in pairs:
-        found.append(front_end.process(pair))
-        front_end.odometry.complete()
-    return found
 
 
 def test_points_project_to_the_pixels_they_were_matched_at() -> None:
@@ -108,31 +92,6 @@ def test_a_dim_image_is_brightened_and_its_noise_is_known(place: Geometry, pairs
     assert bright.lower.noise_grey < 3.0
 
 
-class Seen(RigHealth):
-    """State of a rig that notes the first pairs, and decides nothing."""
-
-    def __init__(self, place: Geometry) -> None:
-        super().__init__(place.cylinder, "warn")
-        self.pairs: list[tuple[int, bool]] = []  # number, and whether its motion is given
-
-    def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
-        assert isinstance(pair, Panoramas)
-        self.pairs.append((pair.seq, exposure is not None))
-
-
-def test_the_rig_is_checked_by_pairs_that_are_not_synchronised_after_odometry_has_found_their_motion(
-    place: Geometry, pairs: list[FramePair]
-) -> None:
-    at_once, skewed = Seen(place), Seen(place)
-    for health, skew_s in ((at_once, 0.0), (skewed, 0.015)):
-        front_end = FrontEnd(place, Config(), health)
-        for number, pair in enumerate(pairs[:CHECKED]):
-            front_end.process(FramePair(number, pair.stamp_ns, pair.lower, pair.upper, skew_s))
-    assert at_once.pairs == [(number, False) for number in range(CHECKED)]
-    assert [number for number, _ in skewed.pairs] == list(range(CHECKED - 1))
-    assert all(is_given for number, is_given in skewed.pairs if number > 0)
-
-
 def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
     place: Geometry, pairs: list[FramePair], scene: Path
 ) -> None:
@@ -146,27 +105,13 @@ def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
             np.clip(camera.shown(image.astype(np.float32), 0.0), 0, 255).astype(np.uint8)
             for camera, image in zip(reflected, (pair.lower, pair.upper), strict=True)
         )
-        update = front_end.process(FramePair(pair.seq, pair.stamp_ns, lower, upper))
+        update = front_end.pose(FramePair(pair.seq, pair.stamp_ns, lower, upper))
         if update.depth.earlier is not None and update.is_keyframe:
             T = truth.T[truth.stamps_ns == pair.stamp_ns][0]
             matched = front_end.dense.points(update.depth.panoramas, update.depth.exposure)
             below += int((se3.apply(T, matched.points)[:, 2] < -0.5).sum())
             confirmed += int((se3.apply(T, front_end.dense.of(update.depth).points)[:, 2] < -0.5).sum())
     assert below > 100 and confirmed < 0.4 * below, (below, confirmed)
-
-
-@pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
-def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) -> None:
-    """A wall whose disparity is 60 px stands 0.6 m away."""
-    place = geometry(make_rig(size=768, baseline_m=0.2), CONFIG.panorama)
-    shape = (place.cylinder.height, place.cylinder.width)
-    lower = texture(1, shape, sigma_px=3)
-    upper = np.roll(lower, 60, axis=0)
-    inner = np.zeros(shape, bool)
-    inner[10:-80] = True
-    dense = DenseDepths(place, replace(CONFIG.stereo, min_range_m=min_range_m))
-    depth = dense.points(Panoramas(0, 0, wrapped(lower), wrapped(upper), inner))
-    assert ((np.abs(depth.disparity - 60) < 1).sum() > 5000) == found
 
 
 def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: list[Frame]) -> None:
@@ -195,15 +140,6 @@ def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: l
     )
     graph.run()
     assert statistics.poses == graph.telemetry.of("odometry").processed
-
-
-def test_the_map_is_copied_for_requests(place: Geometry, poses: list[OdometryUpdate]) -> None:
-    places = Places(place, CONFIG, FrontEnd(place, CONFIG).dense)
-    first = places.process(poses[0])
-    assert first is not None and first.copy is None and places.process(SaveMap(9)) is None
-    second, third = places.process(poses[1]), places.process(poses[2])
-    assert second is not None and third is not None
-    assert second.copy is not None and second.copy.ids == (9,) and third.copy is second.copy
 
 
 def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: list[Frame]) -> None:

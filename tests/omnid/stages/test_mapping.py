@@ -102,15 +102,9 @@ def given(stage: MapGrid, updates: list[PlaceUpdate]) -> list[int]:
 def test_it_is_drawn_when_it_is_due_and_has_changed() -> None:
     stage, one, two = MapGrid(0.05, np.eye(4), every_s=2.0), scans(1), scans(2)
     assert given(stage, [grid_update(k, one if k < 7 else two) for k in range(1, 8)]) == [2, 7]
+    # Nor scans of unknown place: of a saved map, or after a gap, until a place is recognised.
+    assert stage.process(replace(grid_update(10, scans(4)), is_known=False)) is None
     assert stage.finish() == []
     assert stage.process(grid_update(8, scans(3))) is None
     [last] = stage.finish()
     assert last.seq == 8 and last.grid.cells.max() == 100
-
-
-def test_scans_of_unknown_place_are_not_drawn_into_the_map() -> None:
-    """Of a saved map, or after a gap, until a place is recognised; the last grid stays."""
-    stage = MapGrid(0.05, np.eye(4), every_s=1.0)
-    known, elsewhere = grid_update(2, scans(1)), replace(grid_update(4, scans(2)), is_known=False)
-    assert given(stage, [known, elsewhere]) == [2] and stage.finish() == []
-    assert given(stage, [grid_update(6, scans(3))]) == [6]

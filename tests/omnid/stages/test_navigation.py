@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
 from omnid.core.mapping.range_scan import RangeScan
+from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.navigator import CROSSES
 from omnid.core.navigation.requests import (
     GoalRequest,
@@ -24,13 +26,15 @@ from omnid.core.navigation.requests import (
     RouteAction,
     RouteRequest,
 )
+from omnid.core.navigation.route import Route
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import MapKeyframes, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
-from omnid.runs.route_files import RouteFiles, TaughtRoutes
+from omnid.runs.files import RouteFiles
+from omnid.sinks.drive import navigation_answers
 from omnid.stages.navigation import NavigationStage
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.topics import Answer
@@ -41,6 +45,7 @@ T_MAP_ODOM = transform(np.array([2.0, -1.0, 0.3]))  # of the base's frames
 PERIOD_NS = 100_000_000
 ODOM, MAP = NavigationFrame.ODOM, NavigationFrame.MAP
 DEPTH: Any = None  # the stage reads none
+NO_MAP: Any = SimpleNamespace(saves=False)
 UNIT = np.eye(6) * 1e-6
 
 
@@ -50,10 +55,12 @@ def fixed_map(
     T_base_rig: np.ndarray,
     stamp_ns: int = 5,
     *,
+    routes: dict[str, Route] | None = None,
     is_new: bool = False,
 ) -> NavigationStage:
     """Return a stage in a map with one keyframe, which stands still."""
-    stage = NavigationStage(settings, collision, T_base_rig, np.eye(4), "site.omap", is_new=is_new)
+    routes = {} if routes is None else routes
+    stage = NavigationStage(settings, collision, T_base_rig, np.eye(4), "site.omap", routes, is_new=is_new)
     stage.keyframes = MapKeyframes({3: stamp_ns}, {3: np.eye(4)})
     return stage
 
@@ -62,28 +69,25 @@ class Robot:
     """A base that follows setpoints exactly, seen through the stage's messages."""
 
     def __init__(self, folder: Path, **of_map: Any) -> None:
+        self.files = RouteFiles(RouteFolder(folder), NO_MAP)
+        of_map = {"routes": self.files.routes, **of_map}
         self.stage = fixed_map(NavigationSettings(), CollisionSettings(), T_BASE_RIG, **of_map)
         self.stage.process(WheelState(True, False))
-        self.files = RouteFiles(RouteFolder(folder))
-        self.written: dict[int, Answer] = {}  # answers to requests to write a route
-        self.writer = TaughtRoutes(RouteFolder(folder), (), self.written.__setitem__)
+        self.answers: dict[int, Answer] = {}  # to requests
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
         self.seq = 0
         self.updates: list[NavigationUpdate] = []
         self.map_state, self.resets = MapState.LOCALIZED, 0
         self.in_map = True
 
-    def send(self, request: NavigationRequest, stamp_ns: int = 0, id: int = 0) -> NavigationUpdate:
-        """Return the state after a request and what the files bring."""
-        self.take(self.files.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id)))
-        return self.updates[-1]
-
-    def take(self, command: NavigationCommand) -> None:
-        """Give a request to the stage."""
-        update = self.stage.process(command)
+    def send(self, request: NavigationRequest, stamp_ns: int = 0, id: int = 0, stops: int = 0) -> NavigationUpdate:
+        """Return the state after a request, which was sent after so many stops, and keep the answers."""
+        update = self.stage.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id, stops))
         assert update is not None
         self.updates.append(update)
-        self.writer.process(update)
+        self.answers |= navigation_answers(update) or {}
+        self.answers |= self.files.write(update) or {}
+        return update
 
     def pass_on(self) -> NavigationUpdate | None:
         """Advance by a period."""
@@ -181,8 +185,7 @@ def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert "no route is being taught" in refusal(RouteRequest(RouteAction.FINISH))
     robot.stage.process(WheelState(False, True, "a stop was asked for"))
     assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))
-    assert "cannot read the route" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
-    assert len(robot.updates[-1].answers) == 9
+    assert "there is no route nowhere" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
 
 
 def test_a_scan_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
@@ -225,3 +228,123 @@ def test_unknown_floor_that_stops_the_wheels_is_passed(tmp_path: Path) -> None:
     robot.stage.process(WheelState(True, False))
     robot.pass_on()
     assert robot.updates[-1].state is NavigationState.AVOIDING
+
+
+@pytest.mark.hazard("H29")
+def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.send(RouteRequest(RouteAction.TEACH, "hall"))
+    for k in range(150):
+        robot.velocity = np.array([0.3, 0.4 * math.sin(k / 20)])
+        robot.pass_on()
+    robot.velocity = np.zeros(2)
+    update = robot.pass_on()
+    assert robot.updates[-1].teaching == "hall" and robot.updates[-1].taught_m == pytest.approx(4.5, abs=0.2)
+    update = robot.send(RouteRequest(RouteAction.FINISH))
+    assert robot.answers[0] == Answer(True, "the route is written") and not update.teaching
+    update = robot.send(RouteRequest(RouteAction.TEACH, "hall"))
+    assert update.answer is not None and "there is a route hall already" in update.answer.refusal
+    assert robot.send(RouteRequest(RouteAction.TEACH, "hall", replace=True)).teaching == "hall"
+    assert "is being taught" in (robot.send(RouteRequest(RouteAction.REPEAT, "hall")).answer or ("",) * 3)[2]
+    robot.send(RouteRequest(RouteAction.STOP))  # so that the old one stays
+    end = robot.pose.copy()
+    robot.send(RouteRequest(RouteAction.REPEAT, "hall", reverse=True))
+    assert robot.updates[-1].task == "route hall"
+    assert robot.run(1200).state is NavigationState.REACHED
+    assert math.hypot(*robot.pose[:2]) < 0.1
+    robot.send(RouteRequest(RouteAction.REPEAT, "hall"))
+    assert robot.run(1200).state is NavigationState.REACHED
+    np.testing.assert_allclose(robot.pose[:2], end[:2], atol=0.1)
+    other = Robot(tmp_path, stamp_ns=6)
+    other.pass_on()
+    update = other.send(RouteRequest(RouteAction.REPEAT, "hall"))
+    assert update.answer is not None and "in the map site.omap as it was then" in update.answer.refusal
+    other.stage.map_name = ""
+    update = other.send(RouteRequest(RouteAction.TEACH, "x"))
+    assert update.answer is not None and "--map FILE.omap" in update.answer.refusal
+
+
+def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path: Path) -> None:
+    for is_new in (True, False):
+        robot = Robot(tmp_path, is_new=is_new)
+        robot.map_state = MapState.ODOMETRY_ONLY
+        robot.pass_on()
+        answer = robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer
+        assert answer is not None and answer.refusal.startswith("" if is_new else "not localised in a map")
+        robot.send(GoalRequest(ODOM, 1.5, 0.0))
+        robot.run()
+        assert robot.updates[-1].teaching == ("hall" if is_new else "")
+        if is_new:
+            robot.resets = 1
+            robot.pass_on()
+            robot.pass_on()  # with the first place in the new odom
+            answer = robot.updates[-1].answer
+            assert answer is not None and "teach it again" in answer.refusal and not robot.updates[-1].teaching
+            assert "not localised" in robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer.refusal
+
+
+@pytest.mark.hazard("H28")
+def test_after_a_reset_a_place_from_before_it_is_none(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.send(GoalRequest(NavigationFrame.MAP, 5.0, 0.0))
+    robot.pass_on()
+    assert robot.updates[-1].state is NavigationState.DRIVING
+    robot.resets, robot.in_map = 1, False
+    for _ in range(3):
+        robot.pass_on()
+    assert robot.updates[-1].state is NavigationState.NOT_LOCALISED and robot.updates[-1].setpoint == STAND
+    late = PlaceUpdate(1, PERIOD_NS, np.eye(4), np.eye(4), UNIT, MapState.LOCALIZED, 3, np.eye(4))
+    robot.stage.process(late)
+    answer = robot.send(GoalRequest(NavigationFrame.MAP, 1.0, 0.0)).answer
+    assert answer is not None and answer.refusal.startswith("not localised in a map")
+
+
+TEACH, FINISH = RouteRequest(RouteAction.TEACH, "hall"), RouteRequest(RouteAction.FINISH)
+REPEAT = RouteRequest(RouteAction.REPEAT, "hall", reverse=True)  # the robot stands at its end
+
+
+def teaching(folder: Path) -> Robot:
+    """Return a robot that has driven a route of 0.9 m, which is being taught."""
+    robot = Robot(folder)
+    robot.pass_on()
+    robot.send(TEACH)
+    for _ in range(30):
+        robot.velocity = np.array([0.3, 0.0])
+        robot.pass_on()
+    robot.velocity = np.zeros(2)
+    robot.pass_on()
+    return robot
+
+
+def test_a_full_disk_loses_no_recording(tmp_path: Path) -> None:
+    folder = tmp_path / "routes"
+    folder.write_text("in the way")
+    robot = teaching(folder)
+    robot.send(FINISH, id=1)
+    assert not robot.answers[1].done and "navigation.routes" in robot.answers[1].text
+    folder.unlink()
+    assert not robot.send(FINISH, id=2).teaching and robot.answers[2].done
+    assert list(RouteFiles(RouteFolder(folder), NO_MAP).routes) == ["hall"]
+
+
+@pytest.mark.hazard("H50")
+def test_no_request_needs_a_file_and_a_halt_ends_a_repetition(tmp_path: Path) -> None:
+    robot = teaching(tmp_path)
+    robot.send(FINISH)
+    for path in tmp_path.iterdir():
+        path.unlink()
+    assert robot.send(REPEAT).state is NavigationState.DRIVING
+    update = robot.send(NavigationVerb.CANCEL)
+    assert update.state is not NavigationState.DRIVING and (update.setpoint is None or not update.setpoint.velocity_mps)
+
+
+@pytest.mark.hazard("H26")
+def test_a_request_from_before_a_stop_begins_nothing(tmp_path: Path) -> None:
+    robot = teaching(tmp_path)
+    robot.send(FINISH)
+    robot.stage.process(WheelState(True, False, stop_count=1))  # a bumper; then it was armed again
+    assert robot.send(REPEAT, id=1).state is not NavigationState.DRIVING
+    assert "a stop or a fault has come since" in robot.answers[1].text
+    assert robot.send(REPEAT, id=2, stops=1).state is NavigationState.DRIVING and robot.answers[2].done

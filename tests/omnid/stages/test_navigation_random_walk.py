@@ -37,11 +37,10 @@ from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
-from omnid.runs.route_files import RouteFiles, TaughtRoutes
+from omnid.runs.files import RouteFiles
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport.topics import Answer
 from tests.omnid.core.navigation.driven_base import Floor, wheel_state
-from tests.omnid.stages.test_navigation import fixed_map
+from tests.omnid.stages.test_navigation import NO_MAP, fixed_map
 
 Array = NDArray[np.float64]
 TICK_S, TICKS_A_POSE = 0.02, 5
@@ -61,8 +60,7 @@ class Walk:
         self.rng, self.seen, self.t_s = random.Random(seed), Counter[str](), 1000.0
         self.law = ControlLaw(SETTINGS, -1)
         self.stage = fixed_map(NAVIGATION, SETTINGS.collision, np.eye(4), is_new=True)
-        self.files, self.written = RouteFiles(RouteFolder(folder)), dict[int, Answer]()
-        self.writer = TaughtRoutes(RouteFolder(folder), (), self.written.__setitem__)
+        self.files = RouteFiles(RouteFolder(folder), NO_MAP)
         self.pose, self.motion = np.zeros(3), (0.0, 0.0)
         self.seq = self.resets = 0
         self.state, self.map_state, self.kind = TrackingState.TRACKING, MapState.LOCALIZED, "free"
@@ -138,11 +136,10 @@ class Walk:
         """Send a request, and take its answer into the oracle."""
         teaching = self.seen_teaching
         self.stage.process(wheel_state(self.law))
-        update = self.stage.process(self.files.process(NavigationCommand(request, self.now_ns, self.now_ns)))
+        update = self.stage.process(NavigationCommand(request, self.now_ns, self.now_ns))
         assert update is not None
-        self.written.clear()
-        self.writer.process(update)
-        accepted = self.written[0].done if self.written else update.answer is not None and not update.answer.refusal
+        written = self.files.write(update)
+        accepted = written[0].done if written else update.answer is not None and not update.answer.refusal
         word = (
             type(request).__name__
             if not isinstance(request, NavigationVerb | RouteRequest)

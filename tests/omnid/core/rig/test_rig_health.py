@@ -157,7 +157,7 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(place: Geometry, true
     config = Config()
     columns = round(3 / 360 * place.cylinder.width)
     health = RigHealth(place.cylinder, "refuse", PERIOD_S)
-    poses = FrontEnd(place, config, health).odometry
+    poses = FrontEnd(place, config, health)
     for number, right in enumerate(true[1][:8]):
         turned = wrapped(np.roll(right.upper.panorama, columns * (number >= 4), axis=1))
         shown = replace(right, upper=turned, stamp_ns=round(number * PERIOD_S * SECONDS))
@@ -165,7 +165,7 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(place: Geometry, true
         assert health.state.is_contradicted == (number >= 6), "the newest three views decide"
     assert entry(RIG, rig_stats(health)).level == 2
     assert poses.process(true[1][8]).state is TrackingState.DEGRADED
-    fits = FrontEnd(place, config, RigHealth(place.cylinder, "refuse", PERIOD_S)).odometry
+    fits = FrontEnd(place, config, RigHealth(place.cylinder, "refuse", PERIOD_S))
     assert fits.process(true[1][8]).state is TrackingState.TRACKING
 
 

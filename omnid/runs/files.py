@@ -1,45 +1,53 @@
-"""The map of places of a run: read at its start, saved now and then by a daemon, and at the end."""
+"""What a run reads and writes beside its outputs: its map of places, and routes. No other thread waits for a disk.
+
+Both are read at the start. Stages of the thread of the files write them, and give the answers to requests for that.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import logging
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from calib.rig_file import rig_toml
 from omnid.config import Config
+from omnid.core.nanoseconds import NS_PER_S
+from omnid.core.navigation.requests import TaughtRoute
+from omnid.core.navigation.route import Route
 from omnid.core.places.place_map import PlaceMap, PlaceRig
-from omnid.engine.graph import Stream, nothing
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
-from omnid.messages import MapCopy, PlaceUpdate, SaveMap
+from omnid.formats.route_file import RouteFolder
+from omnid.messages import NavigationUpdate, PlaceUpdate
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
-from omnid.transport.topics import Answer
+from omnid.transport.topics import MOST_OPEN, Answer, Answers
+
+
+class MapCopy(NamedTuple):
+    """A copy of the map that is to be written, and the ids of the requests for it."""
+
+    places: PlaceMap
+    ids: list[int]
 
 
 class RunPlaces:
     """Holds the map that a run localises in; `places` is None where the run has no map but its own.
 
-    A sink of poses in the map that writes the copies of the map that they carry, so that a robot that is switched off
-    loses little of it. `written` is the file, once the run has written it.
+    While the run goes on the map belongs to the thread of the places: `copy` is called there, and `write` in the
+    thread of the files, so that a robot that is switched off loses little. `written` is the file, once it was written.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        geometry: Geometry,
-        warn: Callable[[str], None],
-        requests: Stream[SaveMap] | None = None,
-        answer: Callable[[int, Answer], object] = nothing,
-    ) -> None:
+    def __init__(self, config: Config, geometry: Geometry, warn: Callable[[str], None], *, saves: bool = False) -> None:
         """Read the file places.map. One that does not exist is made by this run, unless it only localises.
 
-        warn: takes a line for the user. requests: of the bus, to save the map, which is then saved each places.save_s
-        as well; None: at the end only. answer: takes the id of a request; a second call for it does nothing.
+        warn: takes a line for the user. saves: the map is written on request and each places.save_s, too; else at the
+        end only.
 
         Raises OmnidError for a file that is no map, or that of another rig.
         """
@@ -50,11 +58,12 @@ class RunPlaces:
             raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")
         # 1. The map: that of the file, a new one, or none. It must fit the rig, and the panoramas of this run.
         path = self._path = Path(settings.map)
-        self.is_extended = bool(settings.map) and not settings.localize_only  # the file is written
+        self._is_extended = bool(settings.map) and not settings.localize_only  # the file is written
+        self.saves = saves and self._is_extended
         self.places = PlaceMap(settings.limits.max_keyframes) if settings.map else None
-        if self.is_extended:
+        if self._is_extended:
             check_outputs([("--map", path)], [])
-        if self.is_extended and not path.exists():
+        if self._is_extended and not path.exists():
             log(logging.INFO, f"{path.name}: there is no such map: this run begins a new one")
         elif self.places is not None:
             self.places, rig = read_places(path, self.places)
@@ -66,20 +75,32 @@ class RunPlaces:
                 warn(f"{path}: the rig was calibrated again since this map was made")
             self._rig.adapt(self.places, rig)
         self._known = frozenset(self.places.keyframes if self.places else ())
+        self.is_new = not self._known
         # 2. What was saved, and requests for it.
-        self.requests = () if requests is None or not self.is_extended else (requests,)
         self.written: Path | None = None
-        self._answer = answer
+        self._asked: deque[int] = deque(maxlen=MOST_OPEN)  # ids of requests
+        self._save_ns, self._copied_ns = round(settings.save_s * NS_PER_S), 0
+        self._is_writing = False
         self._saved = frozenset[int]()  # keyframes in the file
-        self._seen: MapCopy | None = None
         self._saves, self._error = 0, ""  # number of saves; what the last one failed by
 
-    def process(self, update: PlaceUpdate) -> None:
-        """Write the copy of the map that comes with a pose, if it is a new one."""
-        copy = update.copy
-        if copy is None or copy is self._seen:
-            return
-        self._seen, joined = copy, self._joined(copy.places)
+    def ask(self, id: int) -> None:
+        """Have the map written, and the request with this id answered; from any thread."""
+        self._asked.append(id)
+
+    def copy(self, update: PlaceUpdate) -> MapCopy | None:
+        """Return a copy of the map after a pose, where it is due or was asked for and none is being written."""
+        self._copied_ns = self._copied_ns or update.stamp_ns
+        is_due = self._save_ns and update.stamp_ns - self._copied_ns >= self._save_ns
+        if self.places is None or self._is_writing or not (self._asked or is_due):
+            return None
+        self._is_writing, self._copied_ns = True, update.stamp_ns
+        ids = [self._asked.popleft() for _ in range(len(self._asked))]
+        return MapCopy(self.places.part(self.places.keyframes), ids)
+
+    def write(self, copy: MapCopy) -> Answers:
+        """Write the joined part of a copy, where it is new; return the answers to the requests for it."""
+        joined = self._joined(copy.places)
         answer, self._error = Answer(True, "the map in the file has all that is known already"), ""
         if joined - self._known and joined != self._saved:
             try:
@@ -87,8 +108,8 @@ class RunPlaces:
                 self._saved, self._saves, answer = joined, self._saves + 1, Answer(True, "the map is saved")
             except OmnidError as error:
                 self._error, answer = str(error), Answer(False, f"the map is not saved: {error}")
-        for id in copy.ids:
-            self._answer(id, answer)
+        self._is_writing = False
+        return dict.fromkeys(copy.ids, answer)
 
     def stats(self) -> dict[str, object]:
         """Return how often the map was saved, and why it is not."""
@@ -107,9 +128,9 @@ class RunPlaces:
             self._warn(f"{self._path}: no place of it was recognised: nothing was added to it")
         elif unjoined:
             self._warn(f"{self._path}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
-        if self.is_extended and new:
+        if self._is_extended and new:
             self._write(self.places.part(joined))
-        elif self.is_extended and not self._known:
+        elif self._is_extended and not self._known:
             self._warn(f"{self._path}: no keyframe was found: no map was written")
 
     def _write(self, places: PlaceMap) -> None:
@@ -129,3 +150,32 @@ def place_rig(geometry: Geometry) -> PlaceRig:
     text = rig_toml(replace(rig, lower=lower, upper=upper, covariance=None))
     digest = hashlib.sha256(text.encode()).hexdigest()
     return PlaceRig(geometry.cylinder.full_turn, rig.baseline_m, geometry.T_rig_rect, rig.T_base_rig, digest)
+
+
+class RouteFiles:
+    """The routes of a run: read at its start, written in the thread of the files once they are taught."""
+
+    def __init__(self, folder: RouteFolder, run_map: RunPlaces) -> None:
+        """Read all routes; a damaged file is reported. run_map: is saved with each route, which refers to it."""
+        self._folder, self._run_map = folder, run_map
+        self._written: TaughtRoute | None = None
+        self.routes: dict[str, Route] = {}
+        for name in folder.names():
+            try:
+                self.routes[name] = folder.read(name)
+            except OmnidError as error:
+                log(logging.WARNING, str(error))
+
+    def write(self, update: NavigationUpdate) -> Answers | None:
+        """Write the route of an update, if it is a new one; return the answer to the request to finish it."""
+        taught = update.taught
+        if taught is None or taught is self._written:
+            return None
+        self._written = taught
+        try:
+            self._folder.write(taught.route)
+        except OmnidError as error:
+            return {taught.id: Answer(False, f"{error}; finish it again once that is mended")}
+        if self._run_map.saves:
+            self._run_map.ask(taught.id)
+        return {taught.id: Answer(True, "the route is written")}
