@@ -51,8 +51,8 @@ def small_depth(stamp_ns: int = 0) -> StereoDepth:
 
 
 def settings(folder: Path, **more: Any) -> Config:
-    config = Config()
-    return replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=1, **more))
+    config, given = Config(), {"folder": str(folder), "free_mb": 0, "file_mb": 1, "images_hz": 0.0} | more
+    return replace(config, record=replace(config.record, **given))
 
 
 def set_clock() -> RobotClock:
@@ -83,8 +83,7 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
 @pytest.mark.parametrize("skew_ns", [-16_000_000, 100_000, 16_000_000])
 def test_a_recording_of_fewer_images_holds_whole_pairs(tmp_path: Path, skew_ns: int, upper_first: bool) -> None:
     """Of three seconds at 30 Hz 15 pairs at 5 Hz; the images of each are as far apart as the cameras are."""
-    config = settings(tmp_path)
-    config = replace(config, record=replace(config.record, images_hz=5.0))
+    config = settings(tmp_path, images_hz=5.0)
     recorder = open_recorder(config, "", lambda *_: None, clock=set_clock(), encode=Encoder(np.eye(4), 0))
     for n in range(92):
         lower, upper = frame(n, "lower"), frame(n, "upper")
