@@ -29,8 +29,7 @@ from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.runs.live import ConnectedRobot, run_live
-from omnid.runs.record import record as record_frames
+from omnid.runs.live import ConnectedRobot, record_frames, run_live
 from omnid.runs.replay import ReplayOptions
 from omnid.runs.session import attached_rig, motion_topics
 from omnid.simulation.demonstration import demonstrate

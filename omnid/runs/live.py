@@ -1,9 +1,14 @@
-"""A live run: its robot (cameras, motor, simulated or not), how it joins stages, bus and wheels, and the run itself."""
+"""Live runs: a robot (cameras, motor, simulated or not), how a run joins stages, bus and wheels, and the run itself.
+
+At the end: a run that only records, and the daemon as a systemd service (sd_notify(3)), with the line of a terminal.
+"""
 
 from __future__ import annotations
 
 import faulthandler
 import logging
+import os
+import socket
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -19,6 +24,7 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
 from drivers.cameras.log_camera import LogMotion
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
+from drivers.logs.rotating_log import RotatingLog
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.ipc import ARMED, ControllerState
@@ -29,20 +35,23 @@ from omnid.core.control.safety_rules import AWAITED
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.logging_setup import HANDLER, Report
+from omnid.engine.logging_setup import HANDLER, Report, log
 from omnid.engine.process import prepare, start_thread
 from omnid.engine.robot_clock import RobotClock, fixed_offset
-from omnid.engine.telemetry import Histogram
+from omnid.engine.telemetry import Histogram, Telemetry
 from omnid.light.exposure import ExposureControl, UsefulArea
+from omnid.plain_text import one_line
 from omnid.runs.files import RunPlaces
-from omnid.runs.record import open_recorder
 from omnid.runs.session import Session, run_to_end
-from omnid.runs.systemd import Service, notify, period_s
-from omnid.runs.wiring import Inputs, Outputs, wire
+from omnid.runs.wiring import RECORDED_DEPTH, Inputs, Outputs, wire
+from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
+from omnid.sinks.encoder import Encoder
+from omnid.sinks.recorder import Recorder
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.obstacles import ADVICE, controller_scan
 from omnid.stages.synchronise import MotionInbox
@@ -153,7 +162,7 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         # 3. The status line of systemd and of a terminal.
         outputs.callback(HANDLER.show, "")
         outputs.callback(notify, "STOPPING=1", "STATUS=stopping")
-        service = Service(graph.telemetry, session.statistics, config.service.stall_timeout_s, HANDLER.show)
+        service = Service(graph.telemetry, session.statistics, config.service.stall_timeout_s)
         session.every(period_s(), service, "watchdog")
         # 4. The run, until a signal or a failure ends it.
         if sys.stderr.isatty():
@@ -212,6 +221,8 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         topics.WHEEL_ODOM: config.motion.wheels != "off" and not robot.brings_samples,
     }
     navigation = None
+    if controller is not None and config.controller.collision.check and not config.obstacles.enabled:
+        session.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from obstacles")
     if controller is not None:
         outputs.scans["controller-scan"] = lambda scan: controller.send(controller_scan(scan))
         states = controller.statistics.states = graph.inlet(1, thread="drive")
@@ -287,3 +298,87 @@ def _answer_arming(bus: Bus, state: ControllerState) -> None:
     if answer.refusal == AWAITED:
         text = f"{AWAITED}: {state.problem}"
     bus.answer(answer.id, Answer(not answer.refusal, text), also_before=topics.ARM)
+
+
+def open_recorder(
+    config: Config, rig: str, report: Report, clock: RobotClock, encode: Encoder | None = None
+) -> Recorder:
+    """Return a recorder to the folder of the configuration; the first message makes the first file.
+
+    rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
+    report: takes severity and text of problems. clock: see Recorder. encode: of the other messages of a run, whose
+    images are thinned to record.images_hz; None: all images and nothing else are recorded.
+    """
+    attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
+    folder = Path(config.record.folder)
+    files = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
+    images_hz = config.record.images_hz if encode is not None else 0.0
+    return Recorder(files, config.bus.robot, encode, clock=clock, skip_invalid=True, images_hz=images_hz)
+
+
+def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: Report) -> Recorder:
+    """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
+    clock = RobotClock(report=lambda line: report(logging.WARNING, line))
+    graph = Graph(drops=True, depth=RECORDED_DEPTH)
+    frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
+    recorder = open_recorder(config, rig, report, clock)
+    graph.sink("record", recorder, *frames)
+
+    with closing(recorder), graph.signals():
+        graph.run()
+    state, dropped = recorder.state, graph.telemetry.of("record").dropped
+    written = state.messages - state.lost
+    report(
+        logging.INFO if written else logging.WARNING,
+        f"recorded {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
+        f"refused {recorder.invalid}, oldest files deleted {state.deleted}, {state.status}",
+    )
+    return recorder
+
+
+def notify(*lines: str) -> None:
+    """Send lines such as "READY=1" to systemd without waiting, if it started this process."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    destination = f"\0{address[1:]}" if address.startswith("@") else address
+    kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC
+    with suppress(OSError, ValueError), socket.socket(socket.AF_UNIX, kind) as sender:
+        sender.sendto("\n".join(lines).encode(), socket.MSG_DONTWAIT, destination)
+
+
+def period_s() -> float:
+    """Return the time between two calls of a Service: a third of the watchdog's timeout, so that one may be late."""
+    return min(1.0, float(os.environ.get("WATCHDOG_USEC", 3e6)) * 1e-6 / 3)
+
+
+class Service:
+    """Notifies systemd, each time that it is called, that the daemon is ready, of its status, and feeds the watchdog.
+
+    The watchdog is fed as long as no stage works on one message for longer than a time; the first such stage is logged.
+    A daemon that waits for images has no message in work.
+    """
+
+    def __init__(self, telemetry: Telemetry, statistics: RunStatistics, stall_timeout_s: float) -> None:
+        """stall_timeout_s: longest time that a stage may work on one message."""
+        self._telemetry, self._statistics, self._stall_timeout_s = telemetry, statistics, stall_timeout_s
+        self._was_stalled = False
+        self._poses, self._called_ns = 0, time.monotonic_ns()
+
+    def __call__(self) -> None:
+        """Notify systemd."""
+        # 1. Stages that work on one message for too long.
+        now_ns, found = time.monotonic_ns(), self._statistics
+        busy = [(stage.name, stage.busy_since_ns) for stage in self._telemetry.stages]
+        limit_ns = self._stall_timeout_s / S_PER_NS
+        stalled = [name for name, since_ns in busy if since_ns and now_ns - since_ns > limit_ns]
+        if stalled and not self._was_stalled:
+            log(logging.ERROR, f"stalled: {', '.join(stalled)}; the watchdog of systemd is no longer fed")
+        self._was_stalled = bool(stalled)
+        # 2. State, poses per second since the last call, what was lost.
+        rate_hz = (found.poses - self._poses) / max(1e-3, (now_ns - self._called_ns) * S_PER_NS)
+        self._poses, self._called_ns = found.poses, now_ns
+        state = found.newest.state if found.newest is not None and rate_hz > 0 else "waiting for images"
+        dropped, late = self._telemetry.lost(by_tickers=False), self._telemetry.lost(by_tickers=True)
+        line = f"{found.length_m:.2f} m, {state}, {rate_hz:.1f} poses/s, {dropped} messages dropped, {late} ticks late"
+        line = f"stalled: {', '.join(stalled)}" if stalled else line
+        HANDLER.show(line)
+        notify("READY=1", *([] if stalled else ["WATCHDOG=1"]), f"STATUS={one_line(line)}")

@@ -226,7 +226,24 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         begun_s = time.monotonic()
         with graph.signals():
             run_to_end(graph, run_places)
-        counters = _counters(session, reader, front_end, stages, wheels)
+        found, read, paired = session.statistics, reader.counts, front_end.pairing.counts
+        # All that was lost, by reason, zeros too.
+        drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
+        drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
+        drops["broken"] += paired["broken"]
+        drops["queue"] = graph.telemetry.lost(by_tickers=False)
+        counters = RunCounters(
+            paired["pairs"],
+            found.poses,
+            found.length_m,
+            {state: found.states[state] for state in TrackingState},
+            found.resets,
+            drops,
+            {} if stages.mapping is None else stages.mapping.counts,
+            {} if stages.places is None else stages.places.counts,
+            {} if wheels is None else wheels.counts(),
+            "" if drops["queue"] else pair_loss(front_end.pairing, read),  # else they were dropped on purpose
+        )
         if recorder is not None and recorder.state.messages:
             statuses = [entry(stage_name(stage.name), stage_stats(stage)) for stage in graph.telemetry.stages]
             if front_end.pairing.motion.wheels or front_end.pairing.motion.gyro:
@@ -236,8 +253,8 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
 
         # 5. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
         places = stages.places
-        found = [] if places is None else [places.corrected(each) for each in updates]
-        in_map, live = (np.array(T, float).reshape(-1, 4, 4) for T in (found, [each.T_map_rig for each in updates]))
+        now = [] if places is None else [places.corrected(each) for each in updates]
+        in_map, live = (np.array(T, float).reshape(-1, 4, 4) for T in (now, [each.T_map_rig for each in updates]))
         if options.map_tum and places is not None:
             stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
             warnings += write_trajectory(options.map_tum, stamps_ns, in_map, places.known(updates))
@@ -271,29 +288,6 @@ def _paced(reader: LogReader, graph: Graph, motion: MotionInbox) -> Iterator[Fra
             motion.add(message)
         else:
             yield message
-
-
-def _counters(
-    session: Session, reader: LogReader, front_end: FrontEnd, stages: WiredStages, wheels: ReplayDrive | None
-) -> RunCounters:
-    """Return the counters of the run; all that was lost, by reason, zeros too."""
-    found, read, paired = session.statistics, reader.counts, front_end.pairing.counts
-    drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
-    drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
-    drops["broken"] += paired["broken"]
-    drops["queue"] = session.graph.telemetry.lost(by_tickers=False)
-    return RunCounters(
-        paired["pairs"],
-        found.poses,
-        found.length_m,
-        {state: found.states[state] for state in TrackingState},
-        found.resets,
-        drops,
-        {} if stages.mapping is None else stages.mapping.counts,
-        {} if stages.places is None else stages.places.counts,
-        {} if wheels is None else wheels.counts(),
-        "" if drops["queue"] else pair_loss(front_end.pairing, read),  # else they were dropped on purpose
-    )
 
 
 def _about_input(

@@ -17,7 +17,6 @@ from drivers.logs.streams import MotionTopics
 from omnid.config import Config
 from omnid.controller.ipc import ControllerStart
 from omnid.controller.link import ControllerLink
-from omnid.core.control.control_law import ControllerSettings
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.engine.process import RealtimeSettings
@@ -124,17 +123,11 @@ class Session:
         The wheels stop, and the process ends, at the latest with `outputs`.
         """
         settings = self.config.controller.of_replay if of_replay else self.config.controller
-        start = ControllerStart(self.config.motor, self.with_obstacles_known(settings), realtime, waits=of_replay)
+        settings = settings if self.config.obstacles.enabled else settings.without_obstacles
+        start = ControllerStart(self.config.motor, settings, realtime, waits=of_replay)
         link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor", is_ticker=True)), self.warn)
         self.outputs.callback(link.close)
         return link
-
-    def with_obstacles_known(self, settings: ControllerSettings) -> ControllerSettings:
-        """Return the settings, without the collision monitor where no obstacles are searched, which is reported."""
-        if not settings.collision.check or self.config.obstacles.enabled:
-            return settings
-        self.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from obstacles")
-        return settings.without_obstacles
 
     def encoder(self, rig: Rig, unix_ns: UnixTime | None = None) -> Encoder:
         """Return the encoder of the messages that leave the run; unix_ns: None for that of the clock."""

@@ -72,7 +72,6 @@ class PacedRobot:
     def connect(self, session: Session, motion: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink]:
         """Return one source of both cameras, which advances the time, and the link to the controller."""
         graph, self._report = session.graph, session.warn
-        session.with_obstacles_known(session.config.controller)  # which warns where there are none
         graph.telemetry.add(self._ticks)
         session.parts[SIMULATION] = self.stats
         return [graph.source("cameras", lambda: self._frames(graph.settle, motion), wake=self.close)], self

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -107,7 +106,7 @@ class FrontEnd:
             pair.seq,
             pair.lower,
             pair.upper,
-            partial(self._disparity, pair),
+            lambda exposure: self.dense.points(pair, _moving(exposure)).disparity,
             np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable,
             pair.times,
             interval_s,
@@ -204,10 +203,6 @@ class FrontEnd:
             T_odom_rect,
             covariance_rect,
         )
-
-    def _disparity(self, pair: Panoramas, exposure: Exposure | None) -> NDArray[np.float32]:
-        """Return the disparities (H, W) of a pair for a motion during its exposures."""
-        return self.dense.points(pair, _moving(exposure)).disparity
 
 
 def _moving(exposure: Exposure | None) -> Exposure | None:

@@ -55,9 +55,7 @@ def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
     missing = {name for name, camera in mounted.items() if camera.mask is None}
     decode, stream = Decoder(rig), iter(frames)
     brightest: dict[Camera, NDArray[np.uint8]] = {}
-    attempts = 0
-    while missing and attempts < RIM_ATTEMPTS:
-        attempts += 1
+    for _ in range(RIM_ATTEMPTS if missing else 0):
         for frame in islice(stream, FRAMES_PER_ATTEMPT):
             image = decode(frame)
             if image is not None:
@@ -67,4 +65,6 @@ def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
             if rim is not None:
                 mounted[name] = replace(mounted[name], mask=rim)
                 missing = missing - {name}
+        if not missing:
+            break
     return replace(rig, lower=mounted["lower"], upper=mounted["upper"]) if brightest else rig

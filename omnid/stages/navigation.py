@@ -182,10 +182,8 @@ class NavigationStage:
                 navigator.pause(f"paused by a request: {RESUME}")
             case NavigationVerb.RESUME:
                 _raise_if(navigator.resume(self._situation()))
-            case GoalRequest(frame):
-                self._start("goal", frame, [self._goal_path(request)], command)
-            case PathRequest(frame):
-                self._start("path", frame, [self._given_path(request)], command)
+            case GoalRequest() | PathRequest():
+                self._start(_word(command), request.frame, [self._path(request)], command)
             case RouteRequest(RouteAction.TEACH):
                 self._teach(request)
             case RouteRequest(RouteAction.FINISH):
@@ -202,26 +200,25 @@ class NavigationStage:
         xy = np.vstack([leg.xy for leg in paths[0].legs])
         self._plan = NavigationPlan(frame, xy, paths[0].final_heading_rad)
 
-    def _goal_path(self, goal: GoalRequest) -> DrivePath:
-        pose = self._pose_in(goal.frame)
-        self._require_near(math.dist(pose[:2], (goal.x_m, goal.y_m)))
-        return goal_path(pose, (goal.x_m, goal.y_m), goal.heading_rad)
-
-    def _given_path(self, path: PathRequest) -> DrivePath:
-        pose = self._pose_in(path.frame)
-        away_m = math.dist(pose[:2], path.xy[0])
-        self._require_near(away_m)
+    def _path(self, request: GoalRequest | PathRequest) -> DrivePath:
+        """Return the path of a request, from where the base is."""
+        pose = self._pose_in(request.frame)
+        first = request.xy[0] if isinstance(request, PathRequest) else (request.x_m, request.y_m)
+        away_m = math.dist(pose[:2], first)
+        if not away_m <= self._settings.reach_m:
+            raise OmnidError(f"{away_m:.1f} m away: farther than navigation.reach_m = {self._settings.reach_m:g}")
+        if isinstance(request, GoalRequest):
+            return goal_path(pose, (request.x_m, request.y_m), request.heading_rad)
         if away_m > ENTRY_M:
             raise OmnidError(
                 f"the path begins {away_m:.1f} m away from the robot, expected at most {ENTRY_M:g} m: "
                 "drive to its start (`omnid goto`), or let it begin here"
             )
-        return drive_path(np.vstack([pose[None, :2], path.xy]), path.heading_rad)
+        return drive_path(np.vstack([pose[None, :2], request.xy]), request.heading_rad)
 
     def _repeated(self, request: RouteRequest) -> list[DrivePath]:
         """Return the paths of a repetition."""
         self._require_map()
-        self._require_no_teaching()
         route = self._routes.get(request.name)
         if route is None:
             raise OmnidError(f"there is no route {request.name}; routes: {', '.join(self._routes) or 'none'}")
@@ -244,7 +241,6 @@ class NavigationStage:
         if self._navigator.task.startswith("route") and self._navigator.drive is not None:
             raise OmnidError("a route is being repeated: stop it first")
         self._require_map()
-        self._require_no_teaching()
         if request.name in self._routes and not request.replace:
             again = f"choose another name, or replace it (`omnid route teach {request.name} --replace`)"
             raise OmnidError(f"there is a route {request.name} already: {again}")
@@ -272,7 +268,7 @@ class NavigationStage:
 
     def _finish(self, command: NavigationCommand) -> None:
         """Have the recorded route written; asked for again, the last one is written again, as a disk may be full."""
-        self._require_map()
+        self._require_map(teaches=True)
         if self._recorder is not None:
             created_s = command.arrival_ns // NS_PER_S
             route = self._recorder.route(self._keyframe, self.keyframes.stamps_ns, created_s, self.map_name)
@@ -290,21 +286,16 @@ class NavigationStage:
             return None
         return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rect @ T_map_rect @ self._T_rect_base))
 
-    def _require_map(self) -> None:
+    def _require_map(self, *, teaches: bool = False) -> None:
+        """Raise OmnidError where no route can be tied to a map. teaches: a route may be taught now."""
         if not self.map_name:
             raise OmnidError(
                 "routes need a map that is saved: start the robot (`omnid run`, `omnid simulate`) with --map FILE.omap"
             )
-
-    def _require_no_teaching(self) -> None:
-        if self._recorder is not None:
+        if self._recorder is not None and not teaches:
             raise OmnidError(
                 f"the route {self._recorder.name} is being taught: finish it, or drop it (`omnid route stop`)"
             )
-
-    def _require_near(self, away_m: float) -> None:
-        if not away_m <= self._settings.reach_m:
-            raise OmnidError(f"{away_m:.1f} m away: farther than navigation.reach_m = {self._settings.reach_m:g}")
 
     def _pose_in(self, frame: NavigationFrame) -> Array:
         """Return the pose (3,) of the base in a frame. Raise OmnidError where nothing can be driven in it."""

@@ -87,7 +87,7 @@ from dataclasses import replace
 from pathlib import Path
 from drivers.cameras.log_camera import LogCamera, LogImages, LogPlayback
 from omnid.config import Config
-from omnid.runs.record import record
+from omnid.runs.live import record_frames
 
 log, rig, folder = map(Path, sys.argv[1:])
 config = Config()
@@ -102,7 +102,7 @@ class Camera(LogCamera):
             yield frame
 
 cameras = {name: Camera(playback, name) for name in ("lower", "upper")}
-record(cameras, config, rig.read_text(), lambda *_: None)
+record_frames(cameras, config, rig.read_text(), lambda *_: None)
 """
 
 

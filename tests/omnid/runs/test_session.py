@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.graph import nothing
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.runs.systemd import Service, period_s
+from omnid.runs.live import Service, period_s
 
 
 @pytest.fixture
@@ -42,7 +41,7 @@ def test_a_stalled_stage_stops_the_watchdog_and_is_logged_once(
     caplog.set_level(logging.INFO, "omnid")
     telemetry = Telemetry()
     stage, _ = telemetry.add(StageStats("valve")), telemetry.add(StageStats("idle"))
-    service = Service(telemetry, RunStatistics(), 0.5, nothing)
+    service = Service(telemetry, RunStatistics(), 0.5)
     stage.busy_since_ns = time.monotonic_ns()
     service()
     line = "0.00 m, waiting for images, 0.0 poses/s, 0 messages dropped, 0 ticks late"

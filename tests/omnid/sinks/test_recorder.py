@@ -21,7 +21,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import MapUpdate, OdometryUpdate, Panoramas, StereoDepth
-from omnid.runs.record import open_recorder
+from omnid.runs.live import open_recorder
 from omnid.sinks.encoder import Encoder
 from omnid.transport.codec import ERROR, OK, Diagnostics, DiagnosticStatus
 from omnid.transport.status_names import RECORDING, entry
