@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -31,79 +32,69 @@ class Dewarp:
     def __init__(self, geometry: Geometry, config: PanoramaConfig) -> None:
         self._noise_grey: dict[Side, float] = {}  # noise of each camera before its gain
         self._measured_ns: int | None = None  # stamp of the pair in which the noise was measured last
-        self._pad_px = config.pad_px
-        rig, cylinder = geometry.rig, geometry.cylinder
-        self._sector, self._scale = (cylinder.turn_px, cylinder.first), cylinder.scale
-        self._lower, self._upper = (remap_tables(rig, one, cylinder, config.pad_px) for one in (rig.lower, rig.upper))
-        self._blur_px = _blur_px((self._lower, self._upper))
+        self._pad_px, self._inner = config.pad_px, np.s_[:, config.pad_px : -config.pad_px]
+        rig, self._cylinder = geometry.rig, geometry.cylinder
+        self._lower, self._upper = tables = [
+            remap_tables(rig, one, self._cylinder, config.pad_px) for one in (rig.lower, rig.upper)
+        ]
+        self._blur_px = _blur_px(tables)
         both = visible(rig.lower, self._lower, config.rim_margin_px)
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
-        self._visible = np.ascontiguousarray(_inner(both, config.margin_px)[:, config.pad_px : -config.pad_px])
+        self._visible = np.ascontiguousarray(_inner(both, config.margin_px)[self._inner])
         if not self._visible.any():
             raise OmnidError("the cameras share no part of the panorama: check the rig's transforms and masks")
-        self._tiles = TileMonitor(self._visible, tile_columns(cylinder))
-        self.upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
-        inner = slice(config.pad_px, -config.pad_px)
-        lower, upper = (tuple(table[:, inner] for table in maps) for maps in (self._lower, self._upper))
+        self._tiles = TileMonitor(self._visible, tile_columns(self._cylinder))
+        self._upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
+        (lower_u, lower_v), (upper_u, upper_v) = ([table[self._inner] for table in maps] for maps in tables)
         self.raw_images = (
-            RawImage(lower[0], lower[1], rig.lower.camera.size),
-            RawImage(upper[0], upper[1], rig.upper.camera.size),
+            RawImage(lower_u, lower_v, rig.lower.camera.size),
+            RawImage(upper_u, upper_v, rig.upper.camera.size),
         )
-        self._rows_s = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper) if line_s]
+        self._rows_s = [rows * np.float32(line_s) for rows in (lower_v, upper_v)] if line_s else []
 
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
-        # 1. Rectify both images; the noise is measured in some of the pairs.
-        since_ns = NOISE_NS if self._measured_ns is None else abs(pair.stamp_ns - self._measured_ns)
-        if measured := since_ns >= NOISE_NS:
+        # 1. Rectify both images, with the padding and without; the noise is measured in some of the pairs.
+        raw: dict[Side, tuple[NDArray[np.uint8], Maps, Steps]] = {
+            "lower": (pair.lower, self._lower, pair.jpeg_steps[0]),
+            "upper": (pair.upper, self._upper, pair.jpeg_steps[1]),
+        }
+        padded, grey = dict[Side, NDArray[np.uint8]](), dict[Side, NDArray[np.uint8]]()
+        for side, (image, maps, _) in raw.items():
+            smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
+            padded[side] = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
+            grey[side] = np.ascontiguousarray(padded[side][self._inner])
+        if self._measured_ns is None or abs(pair.stamp_ns - self._measured_ns) >= NOISE_NS:
             self._measured_ns = pair.stamp_ns
-        lower, lower_grey = self._remapped(pair.lower, self._lower, "lower", measured)
-        upper, upper_grey = self._remapped(pair.upper, self._upper, "upper", measured)
+            self._noise_grey = {side: noise_sigma(grey[side], self._visible) for side in SIDES}
         # 2. The light of each, and of the camera that shows less contrast, which decides how much there is.
-        images: dict[Side, NDArray[np.uint8]] = {"lower": lower_grey, "upper": upper_grey}
-        sums = {side: self._tiles.sums(side, image) for side, image in images.items()}
+        sums = {side: self._tiles.sums(side, grey[side]) for side in SIDES}
         lights = [light(sums[side], self._noise_grey[side]) for side in SIDES]
         dimmer = min(lights, key=lambda light: light.contrast_to_noise)
         # 3. Gains for dim images.
         by_level = gain_of(lights[0].level_grey), gain_of(lights[1].level_grey)
-        lower_gain, upper_gain = pair_gains(sums["lower"], sums["upper"], by_level)
-        # 4. Times of exposure of the pixels, and parts of the images that are dead or blind.
-        times = PixelTimes(pair.skew_s + self.upper_delay_s, *self._rows_s)
-        tiles = self._tiles.update(pair.stamp_ns, images, sums, self._noise_grey)
-        return Panoramas(
-            pair.seq,
-            pair.stamp_ns,
-            self._padded(lower, lower_gain, "lower", pair.jpeg_steps[0]),
-            self._padded(upper, upper_gain, "upper", pair.jpeg_steps[1]),
-            self._visible,
-            times,
-            dimmer,
-            pair.motion,
-            tiles,
+        gains = dict(zip(SIDES, pair_gains(sums["lower"], sums["upper"], by_level), strict=True))
+        cylinder = self._cylinder
+        lower, upper = (
+            PaddedPanorama(
+                brightened(padded[side], gains[side]),
+                self._pad_px,
+                gains[side] * self._noise_grey[side],
+                gains[side],
+                cylinder.turn_px,
+                cylinder.first,
+                raw[side][2],
+                cylinder.scale,
+            )
+            for side in SIDES
         )
-
-    def _remapped(
-        self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return a panorama as the camera gave it, with its padding and without.
-
-        measured: measure the noise of this camera again.
-        """
-        smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
-        remapped = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
-        inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
-        if measured:
-            self._noise_grey[camera] = noise_sigma(inner, self._visible)
-        return remapped, inner
-
-    def _padded(self, remapped: NDArray[np.uint8], gain: float, camera: Side, steps: Steps) -> PaddedPanorama:
-        """Return a panorama multiplied by a gain; steps: of the quantisation of its JPEG."""
-        noise_grey = gain * self._noise_grey[camera]
-        image, of_turn = brightened(remapped, gain), (*self._sector, steps, self._scale)
-        return PaddedPanorama(image, self._pad_px, noise_grey, gain, *of_turn)
+        # 4. Times of exposure of the pixels, and parts of the images that are dead or blind.
+        times = PixelTimes(pair.skew_s + self._upper_delay_s, *self._rows_s)
+        tiles = self._tiles.update(pair.stamp_ns, grey, sums, self._noise_grey)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
 
 
-def _blur_px(tables: tuple[Maps, ...]) -> float:
+def _blur_px(tables: Sequence[Maps]) -> float:
     """Return the sigma [px] of the blur of the images, so that a coarser panorama has no aliasing; 0: none.
 
     A pixel of a panorama that covers n pixels of the image has the blur that makes one of n.
