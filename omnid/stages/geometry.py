@@ -20,8 +20,7 @@ from omnid.stages.synchronise import Decoder
 
 Array = NDArray[np.float64]
 
-RIM_ATTEMPTS = 5  # Attempts to find the rims, each with more images than the one before.
-FRAMES_PER_ATTEMPT = 12  # frames of both cameras added to the maximum image
+FRAMES = 12  # of both cameras, in the maximum of which the rims are looked for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,19 +51,13 @@ def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
     A rim is sought in the maximum of the images: a single one may be dark on one side.
     """
     mounted: dict[Camera, MountedCamera] = {"lower": rig.lower, "upper": rig.upper}
-    missing = {name for name, camera in mounted.items() if camera.mask is None}
-    decode, stream = Decoder(rig), iter(frames)
-    brightest: dict[Camera, NDArray[np.uint8]] = {}
-    for _ in range(RIM_ATTEMPTS if missing else 0):
-        for frame in islice(stream, FRAMES_PER_ATTEMPT):
-            image = decode(frame)
-            if image is not None:
-                brightest[frame.camera] = np.maximum(brightest.get(frame.camera, image), image)
-        for name in missing & brightest.keys():
-            rim = find_rim(brightest[name], mounted[name].camera.center)
-            if rim is not None:
-                mounted[name] = replace(mounted[name], mask=rim)
-                missing = missing - {name}
-        if not missing:
-            break
+    missing = [name for name, camera in mounted.items() if camera.mask is None]
+    decode, brightest = Decoder(rig), dict[Camera, NDArray[np.uint8]]()
+    for frame in islice(frames, FRAMES if missing else 0):
+        image = decode(frame)
+        if image is not None:
+            brightest[frame.camera] = np.maximum(brightest.get(frame.camera, image), image)
+    for name in missing:
+        rim = find_rim(brightest[name], mounted[name].camera.center) if name in brightest else None
+        mounted[name] = replace(mounted[name], mask=rim)
     return replace(rig, lower=mounted["lower"], upper=mounted["upper"]) if brightest else rig
