@@ -220,17 +220,12 @@ UNKNOWN: Final = "the way ahead is unknown"
 UNWATCHED: Final = "the images of the way ahead are frozen, dark or dirty"
 UNSEEN: Final = "the images show nothing: they are frozen, dark or dirty"
 SCAN_STALE: Final = "no new obstacle scan"
-IMAGES_REMEDY: Final = "check light, mirrors and cameras, which the status names"
-_REMEDIES: Final = {
-    SCAN_STALE: "check the cameras and the load; see controller.collision.stale_s",
-    UNWATCHED: IMAGES_REMEDY,
-    UNSEEN: IMAGES_REMEDY,
-}
+IMAGES_REMEDY: Final = "check light, mirrors, cameras and load, which the status names"
 
 
 def remedy(reason: str) -> str:
     """Return what to do about a reason to slow down or stop."""
-    return _REMEDIES.get(reason, "drive back or turn away, or clear the way")
+    return IMAGES_REMEDY if reason in (SCAN_STALE, UNWATCHED, UNSEEN) else "drive back or turn away, or clear the way"
 
 
 class Allowance(NamedTuple):

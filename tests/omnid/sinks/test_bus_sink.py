@@ -222,16 +222,6 @@ def test_no_pose_of_a_replay_drives_before_its_rig_is_checked(link: Any) -> None
     assert len(link.poses) == len(link.setpoints) == 2
 
 
-def test_a_pose_of_a_replay_counts_as_captured_on_arrival_and_renews_the_setpoint(link: Any) -> None:
-    drive = ReplayDrive(link, AHEAD, np.eye(4), rig_health())
-    before_ns = time.monotonic_ns()
-    for stamp_ns in (10**18, 10**18 + 10**8):
-        drive.process(pose_at(stamp_ns))
-    assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD, AHEAD]
-    assert all(before_ns <= pose.stamp_ns <= time.monotonic_ns() for pose in link.poses)
-    assert [arrival_ns for _, arrival_ns in link.setpoints] == [pose.stamp_ns for pose in link.poses]
-
-
 def test_setpoints_and_answers_of_the_navigation() -> None:
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
     refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
