@@ -4,17 +4,18 @@ from __future__ import annotations
 
 
 class Backoff:
-    """Waits that double from 0.1 s up to `longest_s`; reads no clock and does not wait itself."""
+    """Waits that double from 0.1 s up to 2 s; reads no clock and does not wait itself."""
 
-    def __init__(self, longest_s: float) -> None:
-        self._first_s, self._longest_s = min(0.1, longest_s), longest_s
-        self._next_s = self._first_s
+    _next_s: float
+
+    def __init__(self) -> None:
+        self.reset()
 
     def next_s(self) -> float:
         """Return the wait before the next try [s]."""
-        wait_s, self._next_s = self._next_s, min(2 * self._next_s, self._longest_s)
+        wait_s, self._next_s = self._next_s, min(2 * self._next_s, 2.0)
         return wait_s
 
     def reset(self) -> None:
         """Begin again with the first wait, after a success."""
-        self._next_s = self._first_s
+        self._next_s = 0.1

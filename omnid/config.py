@@ -111,7 +111,7 @@ class LogConfig:
     time: Annotated[
         TimeSource,
         "when an image was taken: 'header': the stamp of its message, 'log': the time of logging, 'auto': the "
-        "header's, or the log's where those are not set, do not advance, run back, or are of two clocks",
+        "header's, or the log's where one of those is not set",
     ] = "auto"
 
 

@@ -15,7 +15,7 @@ from typing import Final, TypeAlias, TypeVar
 from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import BY_NAME, LogCameras, LogReader
 from drivers.logs.streams import MotionTopics
 from drivers.motion import MotionSample
 
@@ -35,20 +35,13 @@ class LogImages:
     warnings: tuple[str, ...] = ()  # of the reader, a line each
 
     @staticmethod
-    def load(
-        path: Path,
-        lower: str | None = None,
-        upper: str | None = None,
-        motion: MotionTopics | None = None,
-        bits: int = 16,
-    ) -> LogImages:
-        """Load the images of a log. lower, upper: topics, where their names do not identify the cameras.
+    def load(path: Path, cameras: LogCameras = BY_NAME, motion: MotionTopics | None = None) -> LogImages:
+        """Load the images of a log; motion: topics of wheels and IMU; None: they are not read.
 
-        motion: topics of wheels and IMU; None: they are not read. bits: see Frame. Raises DriverError where a camera
-        has fewer than two images, and beyond MAX_LOG_BYTES.
+        Raises DriverError where a camera has fewer than two images, and beyond MAX_LOG_BYTES.
         """
         frames, samples, left_bytes = list[Frame](), list[MotionSample](), MAX_LOG_BYTES
-        with closing(LogReader(path, lower, upper, motion=motion, bits=bits)) as reader:
+        with closing(LogReader(path, cameras, motion=motion)) as reader:
             for message in reader.messages():
                 if not isinstance(message, Frame):
                     samples.append(message)

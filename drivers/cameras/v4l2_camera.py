@@ -20,10 +20,7 @@ from drivers.errors import DriverError, EventCallback, ignore_event
 from drivers.frame import Camera, Frame
 
 POLL_S: Final = 0.1  # longest wait until `close` is noticed
-LONGEST_WAIT_S: Final = 2.0  # between two tries to open a lost device
 _PAUSE_S: Final = 0.005  # Pause where poll() reports a device as ready and no buffer is filled.
-_SEQUENCE_COUNT: Final = 2**32  # v4l2_buffer.sequence is an unsigned 32-bit counter
-_MOST_JITTER_NS: Final = 500_000_000  # no delay of a camera that delivers images varies by more
 _MAX_AGE_NS: Final = 10 * 10**9  # no driver keeps a buffer for longer; an older stamp is from another clock
 
 
@@ -50,7 +47,7 @@ class V4l2Camera:
     def frames(self) -> Iterator[Frame]:
         """Yield the frames as they arrive, until `close`; those captured before the first call are discarded."""
         self._reading = True
-        reopening = Backoff(LONGEST_WAIT_S)
+        reopening = Backoff()
         try:
             self._discard()
             while not self._closing.is_set():
@@ -155,7 +152,7 @@ class BufferChecks:
     def __init__(self, name: str, state: CameraState, on_event: EventCallback) -> None:
         self._name, self._state, self._on_event = name, state, on_event
         self.last_sequence: int | None = None  # None: the first buffer of a stream is awaited
-        self._last_valid_ns = self._last_ns = -1  # stamps of the kernel and those that were returned
+        self._last_ns = -1
         self._least_delay_ns: int | None = None  # from valid stamps to their arrivals
         self._reported: set[str] = set()
 
@@ -166,8 +163,8 @@ class BufferChecks:
         counted as an error; a step of the sequence backwards counts as its restart.
         """
         if self.last_sequence is not None:
-            step = (buffer.sequence - self.last_sequence) % _SEQUENCE_COUNT
-            if 0 < step < _SEQUENCE_COUNT // 2:
+            step = v4l2.Int32(buffer.sequence - self.last_sequence).value  # the counter has 32 bits, too
+            if step > 0:
                 self._state.drops += step - 1
             else:
                 self._state.restarts += 1
@@ -180,22 +177,18 @@ class BufferChecks:
         """Return the capture time of a buffer [ns of CLOCK_MONOTONIC], strictly increasing from call to call.
 
         arrival_ns: time at which the buffer was taken from the driver, same clock. A stamp is valid if it is later
-        than the last valid one and at most 10 s before the arrival; others are replaced by the arrival less the least
+        than the one before and at most 10 s before the arrival; others are replaced by the arrival less the least
         delay. v4l2loopback does not declare its clock: its stamps are taken for CLOCK_MONOTONIC, with one warning.
         """
         if buffer.flags & v4l2.TIMESTAMP_MASK != v4l2.TIMESTAMP_MONOTONIC:
             self._report_once("its driver does not declare a clock for its stamps; CLOCK_MONOTONIC is assumed")
-        stamp_ns = buffer.stamp_ns
-        delay_ns, usual_ns = arrival_ns - stamp_ns, self._least_delay_ns or 0
-        # A clock that fell back is later than its own last stamps again some time, but not than those returned since.
-        fell_back = stamp_ns <= self._last_ns and delay_ns > usual_ns + _MOST_JITTER_NS
-        if max(self._last_valid_ns, arrival_ns - _MAX_AGE_NS) < stamp_ns <= arrival_ns and not fell_back:
-            self._last_valid_ns = stamp_ns
+        stamp_ns, delay_ns = buffer.stamp_ns, arrival_ns - buffer.stamp_ns
+        if max(self._last_ns, arrival_ns - _MAX_AGE_NS) < stamp_ns <= arrival_ns:
             self._least_delay_ns = delay_ns if self._least_delay_ns is None else min(self._least_delay_ns, delay_ns)
         else:
             self._state.restamped += 1
             self._report_once("some stamps are not plausible; the times of arrival are used for these, and counted")
-            stamp_ns = arrival_ns - usual_ns
+            stamp_ns = arrival_ns - (self._least_delay_ns or 0)
         self._last_ns = max(stamp_ns, self._last_ns + 1)
         return self._last_ns
 

@@ -74,7 +74,7 @@ def list_controls(fd: int) -> dict[int, CameraControl]:
         if entry.id <= last:
             return found
         last = entry.id
-        if not entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
+        if not entry.flags & v4l2.CONTROL_UNUSABLE:
             # As v4l2-ctl writes it: exposure_time_absolute for 'Exposure Time, Absolute'.
             name = re.sub(r"[^a-z0-9]+", "_", entry.name.decode("utf-8", "replace").lower()).strip("_")
             found[last] = CameraControl(last, name, ValueRange(entry.minimum, entry.maximum, max(1, entry.step)))

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +24,6 @@ _MEMORY_TO_MEMORY: Final = 0x8000 | 0x4000  # V4L2_CAP_VIDEO_M2M and V4L2_CAP_VI
 _BYTES_PER_PIXEL: Final = {"GREY": 1, "NV12": 1, "YUYV": 2, "UYVY": 2}  # of the first plane; others are compressed
 _RATE_TOLERANCE: Final = 0.02  # relative; 29.97 Hz passes for 30 Hz
 _BUFFERS: Final = 4  # v4l2loopback needs exactly this number
-_MILLIHERTZ: Final = 1000  # rates are requested as whole thousandths of 1 Hz
 _ADVICE: Final = {
     errno.ENOENT: "is not there; check the cable and the name, `omnid cameras` lists the cameras",
     errno.EACCES: "may not be read by this user; add the user to group video and log in again",
@@ -181,7 +181,8 @@ def _image_in_force(fd: int, settings: V4l2Settings, pixel_format: str) -> Strea
     # 2. The rate.
     if settings.rate_hz:
         rate = v4l2.StreamParameters(type=v4l2.CAPTURE)
-        rate.timeperframe = v4l2.Fraction(_MILLIHERTZ, round(settings.rate_hz * _MILLIHERTZ))
+        wanted = Fraction(settings.rate_hz).limit_denominator(1000)
+        rate.timeperframe = v4l2.Fraction(wanted.denominator, wanted.numerator)
         with suppress(OSError):  # the rate in force is read next
             v4l2.call(fd, v4l2.S_PARM, rate)
     # 3. What is in force.

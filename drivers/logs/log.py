@@ -1,4 +1,4 @@
-"""A log: the messages of one or more files of any format, in the order of time, and what of them is missing.
+"""A log: the messages of one or more files of any format, in the order of time.
 
 A format states three things only (`LogFile`): where in a file which message is and when it was stamped, what bytes it
 has, and what is attached. The places of all messages are collected first, some 60 bytes a message. So the order in a
@@ -8,11 +8,10 @@ file need not be the order in time.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 import zstandard
@@ -20,18 +19,12 @@ from numpy.typing import NDArray
 
 from drivers.errors import RecordError
 from drivers.frame import Frame
-from drivers.logs.ros_messages import (
-    STAMPED_TYPES,
-    header_stamp,
-    parse_image,
-    parse_motion,
-)
+from drivers.logs.ros_messages import STAMPED_TYPES, header_stamp, parse_image, parse_motion
 from drivers.motion import MotionSample
 
 # Bounds of what is kept in memory, whatever a file states.
 MAX_RECORD_BYTES: Final = 256 * 2**20  # of a message, of an image and of an unpacked chunk
-MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
-MAX_LISTED: Final = 16  # names in a message
+KEPT_CHUNKS: Final = 4  # that stay unpacked: both cameras, wheels and gyro may have been written one after the other
 LATEST_NS: Final = 2**62  # A time beyond is none; the difference of two times fits 64 bits.
 ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame (RFC 8878); no message begins with them
 
@@ -52,12 +45,12 @@ class Topic(NamedTuple):
 class LogFile(ABC):
     """An open file of messages, which may be damaged or malicious."""
 
-    def __init__(self, name: str) -> None:
-        """name: for messages."""
-        self.name = name
+    magic: ClassVar[bytes]  # with which a file of the format begins
+
+    def __init__(self, path: Path) -> None:
+        self.name = str(path)  # for messages
         self.topics: dict[int, Topic] = {}  # by channel; complete after entries()
         self.faults: dict[int, str] = {}  # what cannot be read, by block, or by offset without one; grows by reading
-        self.stated: Counter[int] = Counter()  # messages by channel, by the summary of a closed file, where it has one
         self.cut = ""  # one line that says what is missing at the end, "" of a complete file; known after entries()
 
     @abstractmethod
@@ -69,7 +62,7 @@ class LogFile(ABC):
         """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
 
     def attachments(self) -> dict[str, bytes]:
-        """Return name -> bytes of the attachments of up to 16 MiB, such as a rig; known after entries()."""
+        """Return name -> bytes of the attachments, such as a rig; known after entries()."""
         return {}
 
     def header_ns(self, channel: int, start: bytes | memoryview) -> int:
@@ -96,25 +89,22 @@ class LoggedMessage:
     topic: str
     kind: str  # ROS type such as sensor_msgs/msg/Image; "" where the message cannot be decoded
     log_time_ns: int
-    logged: bytes | memoryview
+    data: memoryview
     aligned: bool = True  # True: CDR (ROS 2); False: the serialisation of ROS 1
 
     def cdr(self) -> bytes:
         """Return the bytes in CDR; raise RecordError for a message of ROS 1."""
         if not self.aligned:
             raise RecordError(f"a {self.kind} of ROS 1 is not read: convert the log by `rosbags-convert`")
-        return bytes(unpack_message(memoryview(self.logged)))
+        return bytes(self.data)
 
     def image(self) -> Frame:
         """Return the image of an image message, see `parse_image`."""
-        return parse_image(self.kind, unpack_message(memoryview(self.logged)), aligned=self.aligned)
+        return parse_image(self.kind, self.data, aligned=self.aligned)
 
     def motion(self) -> MotionSample:
         """Return the sample of wheels or an IMU."""
-        return parse_motion(self.kind, unpack_message(memoryview(self.logged)), aligned=self.aligned)
-
-
-LogState: TypeAlias = Literal["whole", "being written", "cut or corrupt"]
+        return parse_motion(self.kind, self.data, aligned=self.aligned)
 
 
 class Log:
@@ -123,31 +113,22 @@ class Log:
     path, size_bytes: of the file or the folder. topics: name -> ROS type, such as sensor_msgs/msg/Image; '' where it
     cannot be decoded. entries, topic, file (N,): the places of all messages in the order of the files, their indices in
     topics and files.
-    lost: topic -> messages that a summary states, and that are nowhere.
     """
 
-    def __init__(
-        self, path: Path, files: Sequence[LogFile], missing: Sequence[str] = (), *, is_written: bool = False
-    ) -> None:
-        """files: the parts of the log in order; missing: names of those that are not there; is_written: is growing."""
-        self.path, self.files, self._missing, self._is_written, self._closed = path, files, missing, is_written, False
+    def __init__(self, path: Path, files: Sequence[LogFile]) -> None:
+        """files: the parts of the log in order."""
+        self.path, self.files, self._closed, self.topics = path, files, False, dict[str, str]()
         self.size_bytes = sum(file.stat().st_size for file in (path, *path.rglob("*")) if file.is_file())
-        self.topics, self.lost = dict[str, str](), Counter[str]()
         found, topics = list[Entries](), list[int]()
         for file in files:
             entries = file.entries()
             found.append(entries[np.lexsort((entries["offset"], entries["block"]))])
             for each in file.topics.values():
                 self.topics[each.name] = self.topics.get(each.name) or each.kind
-            channels = found[-1]["channel"].tolist()
-            places = {topic_name: place for place, topic_name in enumerate(self.topics)}
-            topics += [places[file.topics[channel].name] for channel in channels]
-            for channel, count in (file.stated - Counter(channels)).items():
-                if channel in file.topics:
-                    self.lost[file.topics[channel].name] += count
+            self._names = [*self.topics]
+            topics += [self._names.index(file.topics[channel].name) for channel in found[-1]["channel"].tolist()]
         self.entries, self.topic = np.concatenate(found), np.array(topics, np.int64)
         self.file = np.repeat(np.arange(len(files)), [*map(len, found)])
-        self._names = [*self.topics]
 
     def counts(self) -> dict[str, int]:
         """Return the number of messages of each topic."""
@@ -176,7 +157,7 @@ class Log:
         file, name = self.files[self.file[row]], self._names[self.topic[row]]
         channel, time_ns, _, block, offset = self.entries[row].item()
         try:
-            data = file.read(block, offset)
+            data = unpack_message(memoryview(file.read(block, offset)))
         except RecordError as error:
             if not self._closed:
                 file.faults.setdefault(block or offset, str(error))
@@ -184,14 +165,12 @@ class Log:
         return LoggedMessage(name, self.topics[name], time_ns, data, file.topics[channel].aligned)
 
     def attachments(self) -> dict[str, bytes]:
-        """Return name -> bytes of the attachments of the first file that has some, such as a rig: up to 16 MiB each."""
+        """Return name -> bytes of the attachments of the first file that has some, such as a rig."""
         return next((found for found in (file.attachments() for file in self.files) if found), {})
 
     @property
-    def state(self) -> LogState:
-        """The state; of a folder of images, and of a database, what is broken within shows when it is read."""
-        if self._is_written:
-            return "being written"
+    def state(self) -> str:
+        """Words for its state; what is broken within an image or a row of a database shows when it is read."""
         return "cut or corrupt" if self.cut or self.faults else "whole"
 
     @property
@@ -201,11 +180,8 @@ class Log:
 
     @property
     def cut(self) -> str:
-        """One line that says where the log ends too early, or which parts are missing; empty for a complete log."""
-        cuts = [file.cut for file in self.files if file.cut]
-        if self._missing:
-            cuts.insert(0, f"parts of the log {str(self.path)!r} are missing: {listed(self._missing)}: used the others")
-        return "; ".join(cuts)
+        """One line that says where the log ends too early; empty for a complete log."""
+        return "; ".join(file.cut for file in self.files if file.cut)
 
     def close(self) -> None:
         """Close the files; may be called twice."""
@@ -226,9 +202,8 @@ def unpack_message(data: memoryview) -> memoryview:
         raise RecordError(f"it does not unpack: {error}") from error
 
 
-def listed(names: Iterable[str], none: str = "") -> str:
-    """Return names in one line, with unprintable characters escaped; none: the text for no names."""
+def listed(names: Iterable[str], none: str = "", most: int = 16) -> str:
+    """Return names in one line, at most so many, with unprintable characters escaped; none: the text for no names."""
     every = sorted(names)
-    shown = ", ".join(name if name.isprintable() else ascii(name)[1:-1] for name in every[:MAX_LISTED])
-    more = f" and {len(every) - MAX_LISTED} more" if len(every) > MAX_LISTED else ""
-    return (shown or none) + more
+    shown = ", ".join(name if name.isprintable() else ascii(name)[1:-1] for name in every[:most])
+    return (shown or none) + (f" and {len(every) - most} more" if len(every) > most else "")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import IO, Literal, Self
+from typing import IO
 
 from mcap.exceptions import McapError
 from mcap.writer import CompressionType, Writer
@@ -19,7 +18,6 @@ from drivers.errors import DriverError
 from drivers.logs.log import LATEST_NS
 from drivers.logs.ros_messages import typestore
 
-_COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _KEPT_TOPICS = ("/tf_static",)  # ROS 2 keeps their newest message for late subscribers, also of `ros2 bag play`
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807\n"
 # rosbag2's YAML: keep last, reliable, transient local, automatic liveliness
@@ -33,10 +31,9 @@ _FLUSH_NS = 5 * 10**8  # A chunk ends after this time, by the stamps.
 class LogWriter:
     """Writes a log; a crash loses at most the last chunk, or half a second of stamps.
 
-    attachments (name -> bytes) are written first, so that they survive a crash. compression: lz4 or none; JPEG images
-    are not made smaller by it. An existing file is replaced, unless exclusive. The file is locked until it is closed.
-    Raises DriverError where the file cannot be created or written (a full disk), and for a message type that ROS 2
-    does not have.
+    attachments (name -> bytes) are written first, so that they survive a crash. JPEG images are not made smaller by a
+    compression. An existing file is replaced, unless exclusive. The file is locked until it is closed.
+    Raises DriverError where the file cannot be created or written (a full disk).
 
     messages: number of messages written; persisted: number of those that would survive a crash now; size_bytes: of the
     file without the current chunk.
@@ -46,15 +43,13 @@ class LogWriter:
         self,
         path: str | os.PathLike[str],
         attachments: Mapping[str, bytes] | None = None,
-        chunk_bytes: int = 256 * 1024,
         *,
-        compression: Literal["lz4", "none"] = "lz4",
+        compression: CompressionType = CompressionType.LZ4,
         exclusive: bool = False,
     ) -> None:
         self._path = Path(path)
         self.messages = self.persisted = self.size_bytes = 0
         self._channels: dict[tuple[str, str], int] = {}
-        self._schemas: dict[str, int] = {}
         try:
             self._file = self._path.open("xb" if exclusive else "wb")
         except OSError as error:
@@ -63,18 +58,22 @@ class LogWriter:
             ) from error
         lock(self._file)
         self.usable, self._flushed_ns = True, -1  # usable: until it is closed or fails
-        with self._guarded():
-            self._writer = Writer(self._file, chunk_bytes, _COMPRESSIONS[compression])
-            self._writer.start("ros2", "omnid")
-            for name, data in (attachments or {}).items():
-                self._writer.add_attachment(0, 0, name, "application/octet-stream", data)
-            self._note_persisted()
+        try:
+            with self._guarded():
+                self._writer = Writer(self._file, compression=compression)
+                self._writer.start("ros2", "omnid")
+                for name, data in (attachments or {}).items():
+                    self._writer.add_attachment(0, 0, name, "application/octet-stream", data)
+                self._note_persisted()
+        except DriverError:
+            self._path.unlink(missing_ok=True)
+            raise
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a message: CDR with its encapsulation header, of a type such as nav_msgs/msg/Odometry.
 
-        stamp_ns: log time [ns of Unix time]. Raises DriverError for an unknown type, an invalid stamp, or where the
-        file cannot be written.
+        stamp_ns: log time [ns of Unix time]. Raises DriverError for an invalid stamp, or where the file cannot be
+        written.
         """
         if not 0 <= stamp_ns < LATEST_NS:
             raise DriverError(f"cannot log a message on {topic!r}: its stamp {stamp_ns} ns is not a time")
@@ -82,40 +81,35 @@ class LogWriter:
             channel = self._channel(topic, schema_name)
             self.messages += 1
             self._writer.add_message(channel, stamp_ns, bytes(data), stamp_ns)
-            # A chunk ends after half a second of stamps; one that has ended is passed to the kernel at once.
+            # A chunk that has ended is passed to the kernel at once.
             self._flushed_ns = stamp_ns if self._flushed_ns < 0 else self._flushed_ns
             if abs(stamp_ns - self._flushed_ns) >= _FLUSH_NS:
                 self._flushed_ns = stamp_ns
-                self._flush()
-            elif self._file.tell() != self.size_bytes:
+                self._writer.flush()  # type: ignore[no-untyped-call]
+            if self._file.tell() != self.size_bytes:
                 self._note_persisted()
 
     def sync(self) -> None:
-        """End the chunk and write all data to the disk; raise DriverError where that fails or the file was deleted."""
+        """End the chunk and write all data to the disk; raise DriverError where that fails."""
         with self._guarded():
-            self._flush()
-            self._reach_disk()
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._note_persisted()
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Write the index, which completes the file, and all data to the disk; may be called twice.
 
-        Raises DriverError where that fails or the file was deleted.
+        Raises DriverError where that fails.
         """
         try:
             if self.usable:
+                self.sync()
                 with self._guarded():
-                    self._flush()
                     self._writer.finish()  # type: ignore[no-untyped-call]
                     self._file.flush()
-                    self._reach_disk()
+                    os.fsync(self._file.fileno())
         finally:
             self._abandon()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -140,37 +134,20 @@ class LogWriter:
     def _channel(self, topic: str, schema_name: str) -> int:
         """Return the channel of a topic and a type."""
         if (topic, schema_name) not in self._channels:
-            if schema_name not in self._schemas:
-                text = schema_text(schema_name).encode()
-                self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text)
+            schema = self._writer.register_schema(schema_name, "ros2msg", _schema_text(schema_name).encode())
             metadata = {"offered_qos_profiles": _TRANSIENT_LOCAL if topic in _KEPT_TOPICS else ""}
-            channel = self._writer.register_channel(topic, "cdr", self._schemas[schema_name], metadata)
-            self._channels[topic, schema_name] = channel
+            self._channels[topic, schema_name] = self._writer.register_channel(topic, "cdr", schema, metadata)
         return self._channels[topic, schema_name]
-
-    def _flush(self) -> None:
-        """End the chunk and pass it to the kernel."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        self._note_persisted()
 
     def _note_persisted(self) -> None:
         self._file.flush()
         self.size_bytes, self.persisted = self._file.tell(), self.messages
 
-    def _reach_disk(self) -> None:
-        os.fsync(self._file.fileno())
-        if os.fstat(self._file.fileno()).st_nlink == 0:
-            self.persisted = 0
-            raise FileNotFoundError(errno.ENOENT, "the file has been deleted")
-
 
 @cache
-def schema_text(schema_name: str) -> str:
-    """Return the definition of a ROS 2 type and of all its parts; raise DriverError for an unknown type."""
-    store = typestore(Stores.ROS2_HUMBLE)
-    if schema_name not in store.fielddefs:
-        raise DriverError(f"unknown message type {schema_name!r}: give a type of ROS 2, such as nav_msgs/msg/Odometry")
-    return store.generate_msgdef(schema_name, ros_version=2)[0]
+def _schema_text(schema_name: str) -> str:
+    """Return the definition of a ROS 2 type and of all its parts."""
+    return typestore(Stores.ROS2_HUMBLE).generate_msgdef(schema_name, ros_version=2)[0]
 
 
 # Advisory locks that mark a file as being written; the kernel releases them when the program ends.
@@ -184,13 +161,10 @@ def lock(file: IO[bytes]) -> None:
 
 def is_locked(path: str | os.PathLike[str]) -> bool:
     """True if a program, this one included, is writing the file; False where it cannot be opened."""
-    if not Path(path).is_file():
-        return False
     try:
-        with open(path, "rb") as file:
-            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
+        if Path(path).is_file():
+            with open(path, "rb") as file:
+                fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
     return False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
@@ -12,29 +11,21 @@ from typing import Final
 from drivers.errors import DriverError
 from drivers.logs.image_folder import ImageFolder, image_folders
 from drivers.logs.log import Log, LogFile, listed
-from drivers.logs.mcap_file import MAGIC as MCAP_MAGIC
 from drivers.logs.mcap_file import McapFile
 from drivers.logs.mcap_writer import is_locked
-from drivers.logs.ros1_bag import MAGIC as BAG_MAGIC
 from drivers.logs.ros1_bag import Ros1Bag
-from drivers.logs.sqlite_bag import MAGIC as SQLITE_MAGIC
 from drivers.logs.sqlite_bag import SqliteBag
 
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
-# A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format. Until it is
-# complete, a recording of omnid ends with .part.
+# A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format.
 _NAME: Final = re.compile(
-    r"(?P<name>.+?)(?:_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?(?P<format>\.(?:mcap|db3|bag))(?:\.part)?"
+    r"(?P<name>.+?)(?:_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?(?P<format>\.(?:mcap|db3|bag))"
 )
-_FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
-    MCAP_MAGIC: McapFile,
-    SQLITE_MAGIC: SqliteBag,
-    BAG_MAGIC: Ros1Bag,
-}
+_FORMATS: Final = (McapFile, SqliteBag, Ros1Bag)
 
 
 def is_log_name(name: str) -> bool:
-    """True if a file is a log by its name, which may be unfinished."""
+    """True if a file is a log by its name."""
     return _NAME.fullmatch(name) is not None
 
 
@@ -44,12 +35,12 @@ def open_log(path: str | os.PathLike[str], rate_hz: float = 0.0) -> Log:
     path: an MCAP file, an SQLite bag of ROS 2 (.db3), a bag of ROS 1 (.bag), a folder with one of these or with the
     parts of one, or a folder with a folder of images for each camera. rate_hz: see `ImageFolder`.
     """
-    given, is_written = Path(path), is_locked(path)  # before it is read: the writer may end in the meantime
-    parts, missing = [given], list[str]()
+    given = Path(path)
+    parts = [given]
     if given.is_dir():
         try:
             logs = logs_in(given)
-            parts, missing = parts_in_order(logs)
+            parts = parts_in_order(logs)
             folders = [] if logs else image_folders(given)
         except OSError as error:
             raise DriverError(f"cannot read the folder {str(given)!r}: {error.strerror}") from error
@@ -63,7 +54,7 @@ def open_log(path: str | os.PathLike[str], rate_hz: float = 0.0) -> Log:
             )
     with ExitStack() as opened:
         files = [opened.enter_context(closing(_open_file(part))) for part in parts]
-        log = Log(given, files, missing, is_written=is_written)
+        log = Log(given, files)
         opened.pop_all()
     return log
 
@@ -74,12 +65,12 @@ def _open_file(path: Path) -> LogFile:
     try:
         if not path.exists() or path.is_file():  # a pipe would be waited for
             with path.open("rb") as file:
-                start = file.read(max(map(len, _FORMATS)))
+                start = file.read(max(len(kind.magic) for kind in _FORMATS))
     except OSError as error:
         raise DriverError(f"cannot read the log {str(path)!r}: {error.strerror}") from error
-    for magic, kind in _FORMATS.items():
-        if start.startswith(magic):
-            return kind(path, str(path))
+    for kind in _FORMATS:
+        if start.startswith(kind.magic):
+            return kind(path)
     found = f"it starts with {start!r}" if start else "it is empty, or no regular file"
     raise DriverError(
         f"{str(path)!r} is no log: {found}: give one of {', '.join(LOG_SUFFIXES)}, unpacked if it was compressed"
@@ -87,31 +78,20 @@ def _open_file(path: Path) -> LogFile:
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """Return the logs in a folder by their names. Raise OSError where it is unreadable.
-
-    One that was cut is one of them, unless it is there completed, or is being written.
-    """
-    return [
-        file
-        for file in sorted(folder.iterdir())
-        if is_log_name(file.name)
-        and file.is_file()
-        and (file.suffix in LOG_SUFFIXES or not (file.with_suffix("").exists() or is_locked(file)))
-    ]
+    """Return the logs in a folder by their names, without those being written. Raise OSError where it is unreadable."""
+    files = sorted(folder.iterdir())
+    return [file for file in files if is_log_name(file.name) and file.is_file() and not is_locked(file)]
 
 
-def parts_in_order(logs: list[Path]) -> tuple[list[Path], list[str]]:
-    """Return the parts of a log in the order of their numbers, none where the files are not such parts, and its gaps.
+def parts_in_order(logs: list[Path]) -> list[Path]:
+    """Return the parts of a log in the order of their numbers, none where the files are not such parts.
 
-    Parts have one name and numbers: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them. A single log is its
-    only part; where more numbers lack than are there, the files are of several recordings.
+    Parts have one name and consecutive numbers: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them. A single
+    log is its only part.
     """
     matches = [(log, match) for log in logs if (match := _NAME.fullmatch(log.name))]
     found = {int(match["part"] or -1): log for log, match in matches}
-    names, numbers = {(match["name"], match["format"]) for _, match in matches}, sorted(found)
-    is_one = len(found) == len(logs) and len(names) == 1 and (len(logs) == 1 or numbers[0] >= 0)
-    if not is_one or numbers[-1] - numbers[0] >= 2 * len(numbers):
-        return [], []
-    ((name, suffix),) = names
-    gaps = [f"{name}_{number}{suffix}" for number in range(numbers[0], numbers[-1]) if number not in found]
-    return [found[number] for number in numbers], gaps
+    numbers, names = sorted(found), {(match["name"], match["format"]) for _, match in matches}
+    if len(names) != 1 or numbers != list(range(numbers[0], numbers[0] + len(logs))) or (numbers[0] < 0 and logs[1:]):
+        return []
+    return [found[number] for number in numbers]

@@ -5,36 +5,35 @@ from __future__ import annotations
 import os
 from functools import lru_cache
 from pathlib import Path
+from struct import Struct
 from typing import Final
 
 import numpy as np
 from rosbags.rosbag1 import Reader
 
 from drivers.errors import DriverError, RecordError, one_line
-from drivers.logs.log import ENTRY, Entries, LogFile, Topic
-from drivers.logs.ros_messages import HEADER_BYTES
+from drivers.logs.log import ENTRY, KEPT_CHUNKS, Entries, LogFile, Topic
 
-MAGIC: Final = b"#ROSBAG V2.0\n"
-_KEPT_CHUNKS: Final = 4  # that stay unpacked
-_LENGTH_BYTES: Final = 4  # of the head of a record, and of its data, before each (wiki.ros.org/Bags/Format/2.0)
+_LENGTH: Final = Struct("<I")  # of the head of a record, and of its data, before each (wiki.ros.org/Bags/Format/2.0)
 
 
 class Ros1Bag(LogFile):
     """A LogFile of one .bag file; raises DriverError where it cannot be read."""
 
-    def __init__(self, path: Path, name: str) -> None:
-        super().__init__(name)
+    magic = b"#ROSBAG V2.0\n"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
         self._bag = Reader(path)
         try:
             self._bag.open()
             self._file = path.open("rb", buffering=0)
         except Exception as error:  # of any kind, as it trusts the lengths in the bytes
             reason = f"{one_line(error)}; if its recorder was stopped, try `rosbag reindex`"
-            raise DriverError(f"cannot read the bag {name!r}: {reason}") from error
+            raise DriverError(f"cannot read the bag {self.name!r}: {reason}") from error
         for of in self._bag.connections:
             self.topics[of.id] = Topic(of.topic, of.msgtype, aligned=False)
-            self.stated[of.id] = len(self._bag.indexes[of.id])
-        self._chunk = lru_cache(_KEPT_CHUNKS)(self._unpacked)
+        self._chunk = lru_cache(KEPT_CHUNKS)(self._unpacked)
 
     def entries(self) -> Entries:
         """Return the places of all messages by the index, chunk by chunk."""
@@ -46,8 +45,7 @@ class Ros1Bag(LogFile):
         found = []
         for block, offset, channel, time_ns in sorted(places):
             try:
-                start = self.read(block, offset)[:HEADER_BYTES]
-                found.append((channel, time_ns, self.header_ns(channel, start), block, offset))
+                found.append((channel, time_ns, self.header_ns(channel, self.read(block, offset)), block, offset))
             except RecordError as error:
                 self.faults.setdefault(block, str(error))
         return np.array(found, ENTRY)
@@ -56,8 +54,8 @@ class Ros1Bag(LogFile):
         """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
         data = self._chunk(block)
         for _ in ("head", "data"):
-            size = int.from_bytes(data[offset : offset + _LENGTH_BYTES], "little")
-            begin, offset = offset + _LENGTH_BYTES, offset + _LENGTH_BYTES + size
+            size = int.from_bytes(data[offset : offset + _LENGTH.size], "little")
+            begin, offset = offset + _LENGTH.size, offset + _LENGTH.size + size
         if not begin < offset <= len(data):
             raise RecordError(f"the chunk at byte {block}: the message at its byte {offset} is not whole")
         return data[begin:offset]

@@ -20,8 +20,7 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 IMU: Final = "sensor_msgs/msg/Imu"
 STAMPED_TYPES: Final = (*IMAGE_TYPES, ODOMETRY, IMU)  # which begin with a header, whose stamp is used
 BASE_FRAME: Final = "base_link"  # Frame of messages whose axes are those of the base (REP 105), as omnid records them.
-HEADER_BYTES: Final = 12  # of a message that begins with a header: those that tell its stamp
-NOT_MEASURED: Final = -1.0  # first number of the covariance of what an IMU does not measure (sensor_msgs/msg/Imu)
+_HEADER: Final = struct.Struct("<4xiI")  # with which messages begin: after four bytes seconds, nanoseconds
 
 # cv_bridge's names for images without declared colours, in OpenCV's order bgr, and image_encodings.hpp's names of YUV
 _SYNONYMS: Final = {
@@ -54,12 +53,7 @@ def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> Fram
     bayer = source if source.startswith("bayer_") else ""
     # The first bytes decide the encoding, else the format, which is free text such as 'bgr8; jpeg compressed bgr8'.
     encoding = next((name for name, part in (("jpeg", "jp"), ("png", "png")) if part in encoding.lower()), encoding)
-    return Frame(0, stamp_ns, "lower", image_encoding(data, encoding), data, bayer=bayer)
-
-
-def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
-    """Return jpeg or png by the first bytes of an image file, `otherwise` where it is neither."""
-    return _MAGIC.get(bytes(data[:3]), otherwise)
+    return Frame(0, stamp_ns, "lower", _MAGIC.get(bytes(data[:3]), encoding), data, bayer=bayer)
 
 
 def compressed_image(stamp_ns: int, image: bytes) -> bytes:
@@ -82,7 +76,7 @@ def parse_motion(kind: str, message: memoryview, *, aligned: bool = True) -> Mot
         if not math.isfinite(velocity_mps) or math.isinf(yaw_rate_radps):  # wheels may not report their turn
             raise FrameDecodeError(f"a {kind} has rates that are not finite")
         return WheelSample(stamp_ns, velocity_mps, yaw_rate_radps)
-    if found.angular_velocity_covariance[0] == NOT_MEASURED:
+    if found.angular_velocity_covariance[0] == -1.0:  # of what is not measured (sensor_msgs/msg/Imu)
         raise FrameDecodeError(f"a {IMU} has no angular velocity: its covariance begins with -1")
     x, y, z = found.angular_velocity.x, found.angular_velocity.y, found.angular_velocity.z
     if not all(map(math.isfinite, (x, y, z))):
@@ -100,12 +94,12 @@ def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
 
 
 def header_stamp(message: memoryview, *, aligned: bool = True) -> int:
-    """Return the stamp [ns] of the header with which images, wheels and IMUs begin; 0 where it is unset or cut."""
-    start = bytes(message[:HEADER_BYTES])
-    if len(start) < HEADER_BYTES:
-        return 0
+    """Return the stamp [ns] of the header with which images, wheels and IMUs begin; 0 where unset, -1 where cut."""
+    start = bytes(message[: _HEADER.size])
+    if len(start) < _HEADER.size:
+        return -1
     # CDR states its byte order; ROS 1 begins with a sequence number, and its seconds have no sign.
-    layout = ("<4xiI" if start[1] & 1 else ">4xiI") if aligned else "<4xII"
+    layout = (_HEADER.format if start[1] & 1 else ">4xiI") if aligned else "<4xII"
     return _stamp_ns(*struct.unpack(layout, start))
 
 

@@ -1,10 +1,8 @@
 """A recording in several files, which continues while the disk has space and never stops the program.
 
-    <name>_20260131T235900Z_001.mcap.part   being written, or left by a program that crashed: readable up to its end
-    <name>_20260131T235900Z_001.mcap        complete
-
-The time is that of the first message, UTC; the number counts the files of one run and those of the same second. No
-files with other names are deleted. Several programs may share a folder: a file being written is locked.
+The files are <name>_20260131T235900Z_001.mcap: the time is that of the first message, UTC; the number counts the files
+of one run and those of the same second. No files with other names are deleted. Several programs may share a folder: a
+file being written is locked. One that was left by a program that crashed is readable up to its end.
 """
 
 from __future__ import annotations
@@ -17,25 +15,24 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
-from typing import Final, Literal
+from typing import Literal
+
+from mcap.writer import CompressionType
 
 from drivers.errors import DriverError, EventCallback
-from drivers.logs.log import LATEST_NS
 from drivers.logs.mcap_writer import LogWriter, is_locked
-
-_PART: Final = ".part"
-_MB: Final = 10**6
 
 
 @dataclass(frozen=True, slots=True)
 class RotationSettings:
     """Limits at which a new file is started, and limits of the files kept."""
 
-    file_bytes: int = 500 * _MB  # size at which a new file is started
+    file_bytes: int = 500_000_000  # size at which a new file is started
     file_s: float = 600.0  # age at which a new file is started, by the stamps
-    keep_bytes: int = 20_000 * _MB  # of all files, including the one being written at its full size
-    free_bytes: int = 1000 * _MB  # reserved on the disk: with less free space nothing is recorded
+    keep_bytes: int = 20_000_000_000  # of all files, including the one being written at its full size
+    free_bytes: int = 1_000_000_000  # reserved on the disk: with less free space nothing is recorded
     sync_s: float = 3.0  # period of writing to the disk (fsync)
     retry_s: float = 5.0  # wait between two tries after a failure of the disk
 
@@ -44,8 +41,7 @@ class RotationSettings:
 class RotatingLogState:
     """Status and counters; only the writing thread writes them, any thread may read one field at a time."""
 
-    status: Literal["waiting", "recording", "stopped", "closed"] = "waiting"
-    file: str = ""  # being written
+    status: Literal["recording", "stopped", "closed"] = "recording"
     problem: str = ""  # reason for the status "stopped"
     messages: int = 0  # received
     lost: int = 0  # of these, in no file: the disk failed or was full, or they are not valid
@@ -71,111 +67,88 @@ class RotatingLog:
         self._name, self._attachments = re.sub(r"[^\w.-]", "-", name), dict(attachments)
         self._writer: LogWriter | None = None
         self._path = folder
-        self._own: dict[str, int] = {}  # names of the files of this run, in their order
-        self._start_ns = self._lost_before = 0  # first stamp of the file; lost messages when it stopped
+        self._own: dict[str, int] = {}  # number in this run of its files: the clock may be set back meanwhile
+        self._start_ns = 0  # first stamp of the file
         self._synced_s = self._retry_at_s = 0.0
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
         self.state.messages += 1
-        if not 0 <= stamp_ns < LATEST_NS:
-            self.state.lost += 1
-            return
         keep, age_s = self._rotation, abs(stamp_ns - self._start_ns) / 1e9
         if self._writer is not None and (self._writer.size_bytes >= keep.file_bytes or age_s >= keep.file_s):
             self.end_file()
-        is_written = False
+        if self._writer is None and time.monotonic() < self._retry_at_s:
+            self.state.lost += 1
+            return
         try:
             # 1. The file, and the message.
-            if self._writer is None and time.monotonic() >= self._retry_at_s:
-                self._begin_file(stamp_ns)
-            if self._writer is None:
-                self.state.lost += 1
-                return
-            self._writer.write(topic, schema_name, data, stamp_ns)
-            is_written = True
-            if self.state.status == "stopped" and self._writer.persisted:
+            writer = self._writer or self._new_file(stamp_ns)
+            writer.write(topic, schema_name, data, stamp_ns)
+            if self.state.status == "stopped" and writer.persisted:
                 self.state.status, self.state.problem = "recording", ""
-                lost = self.state.lost - self._lost_before
-                self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
+                self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; lost: {self.state.lost}")
             # 2. The disk.
             if time.monotonic() - self._synced_s >= keep.sync_s:
                 self._synced_s = time.monotonic()
-                self._writer.sync()
+                writer.sync()
                 self._require_free_space(keep.free_bytes)
         except DriverError as error:
-            if self._writer is None or not self._writer.usable:
-                self.state.lost += self._writer is None
-                self._stop(error)
-            elif is_written:
-                self.end_file()
-                self._stop(error)
-            else:  # the message is not valid
-                self.state.lost += 1
+            self.state.lost += self._writer is None
+            self._stop(error)
 
     def end_file(self) -> None:
-        """Complete the file, if there is one, and rename it: the next message begins another one."""
+        """Complete the file, if there is one: the next message begins another one."""
         if self._writer is not None:
             try:
                 self._writer.close()
-                self._path.rename(self._path.with_suffix(""))
-            except (DriverError, OSError) as error:
+            except DriverError as error:
                 self._stop(error)
-        self._writer, self.state.file = None, ""
+        self._writer = None
 
     def close(self) -> None:
         """Complete the file and end the recording."""
         self.end_file()
         self.state.status, self._retry_at_s = "closed", math.inf
 
-    def _begin_file(self, stamp_ns: int) -> None:
+    def _new_file(self, stamp_ns: int) -> LogWriter:
         """Create a file with the next number that no other program uses; raise DriverError where that is impossible."""
         self._delete_oldest()
         self._require_free_space(self._rotation.free_bytes + self._rotation.file_bytes)
-        at, number = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9)), 1 + len(self._own)
-        whole = self._folder / f"{self._name}_{at}_{number:03}.mcap"
-        self._path, self._own[whole.name] = whole.with_name(whole.name + _PART), number
-        if os.path.lexists(whole) or os.path.lexists(self._path):
-            self._begin_file(stamp_ns)
-            return
-        try:
-            self._writer = LogWriter(self._path, self._attachments, compression="none", exclusive=True)
-        except DriverError as error:
-            if not isinstance(error.__cause__, FileExistsError):  # of another program
-                self._path.unlink(missing_ok=True)
-            raise
+        at = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9))
+        names = (f"{self._name}_{at}_{number:03}.mcap" for number in count(1 + self.state.files))
+        self._path = next(path for name in names if not os.path.lexists(path := self._folder / name))
+        self._writer = LogWriter(self._path, self._attachments, compression=CompressionType.NONE, exclusive=True)
         self._start_ns, self._synced_s = stamp_ns, time.monotonic()
-        self.state.files, self.state.file = self.state.files + 1, str(self._path)
-        if self.state.status == "waiting":
-            self.state.status = "recording"
+        self.state.files += 1
+        self._own[self._path.name] = self.state.files
+        return self._writer
 
     def _stop(self, error: Exception) -> None:
         """Close the file; its data on the disk is kept."""
         if self.state.status != "stopped":
-            self.state.status, self._lost_before = "stopped", self.state.lost
+            self.state.status = "stopped"
             self._on_event(logging.WARNING, f"recording: stopped, and tried again until it works: {error}")
-        if self._writer is not None:
-            self.state.lost += self._writer.messages - self._writer.persisted
+        writer, self._writer = self._writer, None
+        if writer is not None:
             with suppress(DriverError):  # which has been reported
-                self._writer.close()
-            if not self._writer.persisted:
-                with suppress(OSError):
-                    self._path.unlink()
-        self._writer, self.state.problem, self.state.file = None, str(error), ""
-        self._retry_at_s = time.monotonic() + self._rotation.retry_s
+                writer.close()
+            self.state.lost += writer.messages - writer.persisted
+            if not writer.persisted:
+                self.state.files -= 1
+                self._path.unlink(missing_ok=True)
+        self.state.problem, self._retry_at_s = str(error), time.monotonic() + self._rotation.retry_s
 
     def _delete_oldest(self) -> None:
         """Delete the oldest recordings of this name until there is room for one more within the limit.
 
-        Those of this run are the newest, in their order: the clock may have been set back meanwhile. Files that are
-        being written, or cannot be deleted, are kept, and links are none.
+        Files that are being written, or cannot be deleted, are kept, and links are none.
         """
-        pattern = re.compile(re.escape(self._name) + rf"_\d{{8}}T\d{{6}}Z_\d{{3,}}\.mcap(?:{re.escape(_PART)})?")
+        pattern = re.compile(re.escape(self._name) + r"_\d{8}T\d{6}Z_\d{3,}\.mcap")
         with suppress(OSError):
             names = [name for name in os.listdir(self._folder) if pattern.fullmatch(name)]
-            files = [self._folder / name for name in names if not os.path.islink(self._folder / name)]
-            sizes = {path: path.stat().st_size for path in files}
-            for path in sorted(files, key=lambda path: (self._own.get(path.name.removesuffix(_PART), 0), path.name)):
+            names.sort(key=lambda name: (self._own.get(name, 0), name))
+            sizes = {p: p.stat().st_size for name in names if not os.path.islink(p := self._folder / name)}
+            for path in [*sizes]:
                 if sum(sizes.values()) <= self._rotation.keep_bytes - self._rotation.file_bytes:
                     break
                 if not is_locked(path):
@@ -195,6 +168,6 @@ class RotatingLog:
         free = disk.f_bavail * disk.f_frsize
         if free < wanted_bytes:
             raise DriverError(
-                f"cannot record to {str(self._folder)!r}: {free // _MB} MB are free and "
-                f"{-(-wanted_bytes // _MB)} needed; make room, or keep fewer or smaller files"
+                f"cannot record to {str(self._folder)!r}: {free / 1e6:.0f} MB are free and "
+                f"{wanted_bytes / 1e6:.0f} needed; make room, or keep fewer or smaller files"
             )

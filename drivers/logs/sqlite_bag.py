@@ -18,7 +18,6 @@ import numpy as np
 from drivers.errors import DriverError, RecordError, one_line
 from drivers.logs.log import ENTRY, MAX_RECORD_BYTES, Entries, LogFile, Topic
 
-MAGIC: Final = b"SQLite format 3\0"
 # A file that is shorter than it states is read up to its end with a writable schema only; it is opened read-only.
 _PRAGMAS: Final = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "writable_schema = ON")
 _TOPICS: Final = "SELECT id, name, type, serialization_format FROM topics"
@@ -35,14 +34,23 @@ _FAULTS: Final = (sqlite3.Error, OverflowError)
 class SqliteBag(LogFile):
     """A LogFile of one .db3 file; raises DriverError where it is no bag."""
 
-    def __init__(self, path: Path, name: str) -> None:
-        super().__init__(name)
+    magic = b"SQLite format 3\0"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        # A file without a write-ahead log or a journal is read as one that does not change: SQLite would lock it.
+        changes = any(Path(f"{path}{suffix}").exists() for suffix in ("-wal", "-journal"))
+        uri = f"file:{quote(str(path.resolve()))}?mode=ro{'' if changes else '&immutable=1'}"
         try:
-            self._bag = _opened(path)
+            self._bag = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._bag.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD_BYTES)
+            for pragma in _PRAGMAS:
+                self._bag.execute(f"PRAGMA {pragma}")
+            self._bag.text_factory = partial(str, encoding="utf-8", errors="replace")
             rows = self._bag.execute(_TOPICS).fetchall()
         except _FAULTS as error:
             raise DriverError(
-                f"cannot read the bag {name!r}: {one_line(error)}; a recording that was cut needs `sqlite3 FILE "
+                f"cannot read the bag {self.name!r}: {one_line(error)}; a recording that was cut needs `sqlite3 FILE "
                 ".recover`, and the files beside it a folder that can be written"
             ) from error
         self.topics = {
@@ -80,22 +88,3 @@ class SqliteBag(LogFile):
     def close(self) -> None:
         """Close the file; may be called twice."""
         self._bag.close()
-
-
-def _opened(path: Path) -> sqlite3.Connection:
-    """Open a file for reading from any thread; it may be damaged or hostile. Raise sqlite3.Error.
-
-    A file without a write-ahead log or a journal beside it is read as one that does not change: SQLite would lock it.
-    """
-    mode = "ro" if any(Path(f"{path}{suffix}").exists() for suffix in ("-wal", "-journal")) else "ro&immutable=1"
-    database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode={mode}", uri=True, check_same_thread=False)
-    try:
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD_BYTES)
-        for pragma in _PRAGMAS:
-            database.execute(f"PRAGMA {pragma}")
-        database.text_factory = partial(str, encoding="utf-8", errors="replace")
-        database.execute(_TOPICS).fetchone()
-    except BaseException:
-        database.close()
-        raise
-    return database

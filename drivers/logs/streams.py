@@ -1,10 +1,7 @@
 """Which topics of a log are the cameras, the wheels and the IMU, and by which of its two times a message is stamped.
 
-A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. The header is
-the better one, and is used unless it is not set. Headers that run back are refused: `log.time` says
-which time is used. In a file the images of a camera are in the
-order of their headers, but for late ones, which fill a hole between others. Where a clock was set back, images lie
-beside others instead, or far behind.
+A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. The headers
+are better, and are used unless some are not set. Times that run back are refused: `log.time` says which are used.
 """
 
 from __future__ import annotations
@@ -25,21 +22,22 @@ Times: TypeAlias = NDArray[np.int64]  # (N,) [ns]
 TimeSource: TypeAlias = Literal["auto", "header", "log"]
 
 _WORDS: dict[str, Camera] = {
-    **dict.fromkeys(("lower", "bottom", "down"), CAMERAS[0]),
-    **dict.fromkeys(("upper", "top", "up"), CAMERAS[1]),
+    **dict.fromkeys(("lower", "bottom", "down"), "lower"),
+    **dict.fromkeys(("upper", "top", "up"), "upper"),
 }
 _COMPRESSED = "/compressed"  # ends the names of compressed images (image_transport)
 _SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second: these are stamps in microseconds.
-_STEP_NS: Final = 500_000_000  # An image is logged by less behind a later one, unless a clock is set.
-_FEW: Final = 0.1  # Up to this share of headers may be unset.
 
 
-def choose_topics(log: str, topics: Mapping[str, str], wanted: Mapping[Camera, str | None]) -> dict[Camera, str]:
+def choose_topics(
+    log: str, topics: Mapping[str, str], wanted: tuple[str | None, str | None], rig: tuple[str, str] = ("", "")
+) -> dict[Camera, str]:
     """Return the topics of the two cameras.
 
-    log: its name for error messages. topics: name -> type. wanted: requested topics, which must exist; a camera
-    without one is identified by a word of its topic's name. Raises DriverError, which lists the candidates, where the
-    choice is ambiguous.
+    log: its name for error messages. topics: name -> type. wanted: requested topics of lower and upper, which must
+    exist; a camera without one has that which the rig states, if both are there: they may have been renamed since it
+    was calibrated; else it is identified by a word of its topic's name. Raises DriverError, which lists the candidates,
+    where the choice is ambiguous.
     """
     images = [name for name, kind in topics.items() if kind in IMAGE_TYPES and not name.endswith("/compressedDepth")]
     if not images:
@@ -47,17 +45,19 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Mapping[Camera, s
             f"no image topics in {log}: found {listed(topics, 'no messages')}; record {IMAGE} or {COMPRESSED_IMAGE} of "
             "both cameras; `omnid log info` says whether the log was cut"
         )
+
+    def transports(name: str) -> list[str]:
+        """Return the topics of an image, which image_transport publishes raw, compressed, or both."""
+        return [each for each in (name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)) if each in images]
+
+    by_rig = [name or stated for name, stated in zip(wanted, rig, strict=True)]
+    names = by_rig if all(name and transports(name) for name in by_rig) else wanted
     found: dict[Camera, str] = {}
-    for camera, name in wanted.items():
-        if name is not None:
-            # image_transport publishes an image raw, compressed, or both.
-            transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
-            mine = [topic for topic in transports if topic in images][:1]
-        else:
-            mine = [topic for topic in images if _camera_of(topic) == camera]
+    for camera, name in zip(CAMERAS, names, strict=True):
+        mine = transports(name)[:1] if name else [topic for topic in images if _camera_of(topic) == camera]
         if len({topic.removesuffix(_COMPRESSED) for topic in mine}) != 1:
             named = f"{'several' if mine else 'no'} topics named after the {camera} camera"
-            problem = named if name is None else f"no topic {name!r} of images"
+            problem = f"no topic {name!r} of images" if name else named
             raise DriverError(f"{problem} in {log}: found {listed(images)}; give --lower and --upper")
         found[camera] = max(mine, key=lambda topic: topic.endswith(_COMPRESSED))
     if found["lower"] == found["upper"]:
@@ -86,12 +86,9 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     chosen, warnings = set[str](), list[str]()
     for kind, name, setting in ((ODOMETRY, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
         if name and topics.get(name) != kind:
-            found = f"holds {topics[name]}" if topics.get(name) else "is not"
-            raise DriverError(f"topic {name!r} {found} in {log}; {setting} must be one of {kind}: {listed(topics)}")
-        names = [name] if name else []
-        if name is None:
-            of_kind = (topic for topic, found in topics.items() if found == kind)
-            names = [topic for topic in of_kind if kind != ODOMETRY or "wheel" in topic.lower()]
+            raise DriverError(f"{name!r} is no topic of {kind} in {log}; {setting} must be one: {listed(topics)}")
+        of_kind = [topic for topic, found in topics.items() if found == kind and name in (None, topic)]
+        names = of_kind if name or kind == IMU else [topic for topic in of_kind if "wheel" in topic.lower()]
         if len(names) > 1:
             warnings.append(f"{log} has several topics of {kind}: {listed(names)}; none is used: set {setting}")
         else:
@@ -99,65 +96,32 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     return chosen, warnings
 
 
-class StampRule(NamedTuple):
-    """By which time the messages of a log are stamped."""
+def choose_stamps(
+    header_ns: Times, log_ns: Times, of_camera: Mapping[Camera, NDArray[np.bool_]], source: TimeSource
+) -> tuple[Times, str]:
+    """Return the stamps (N,) of messages in the order of the file, and a warning where headers are not set.
 
-    by_header: bool
-    delay_ns: int  # usual stamp of the lower camera minus the time of logging, for messages whose header is not set
-    warnings: list[str]
-
-    def stamps_ns(self, header_ns: Times, log_ns: Times) -> Times:
-        """Return the stamps (N,) of messages."""
-        return np.where(self.by_header & (header_ns > 0), header_ns, log_ns + self.delay_ns)
-
-
-def stamp_rule(images: Mapping[Camera, tuple[Times, Times]], source: TimeSource = "auto") -> StampRule:
-    """Return how the messages of a log are stamped, by the images of both cameras.
-
-    images: stamps of the headers, 0 where unset, and times of logging, in the order of the file. Raise DriverError, by
-    "auto", where the times run back, or are too close to each other.
+    header_ns: stamps of their headers, 0 where unset, -1 where cut; log_ns: times of logging; of_camera: which are
+    images of a camera. By "auto", raise DriverError where those of a camera do not advance, or are too close.
     """
-    # 1. Headers that are not set.
-    both, is_auto, warnings = [images[camera] for camera in CAMERAS], source == "auto", list[str]()
-    unset = [int(np.count_nonzero((header_ns == 0) & (log_ns != 0))) for header_ns, log_ns in both]
-    is_unset = any(count > max(1, _FEW * len(header_ns)) for count, (header_ns, _) in zip(unset, both, strict=True))
-    by_header = source == "header" or (is_auto and not is_unset)
-    used = sum(unset) if by_header else is_auto * sum(len(log_ns) for _, log_ns in both)
-    if used:
-        warnings.append(f"used the times of logging for {used} images: the stamps of their headers are 0")
+    # 1. Headers, unless some are not set.
+    is_unset = (header_ns == 0) & (log_ns != 0) & np.logical_or(of_camera["lower"], of_camera["upper"])
+    by_header = source == "header" or (source == "auto" and not is_unset.any())
+    stamps_ns = np.where(by_header & (header_ns > 0), header_ns, log_ns)
+    if source != "auto":
+        return stamps_ns, ""
     # 2. Times that are wrong.
-    faults = [_fault(header_ns if by_header else log_ns, log_ns) for header_ns, log_ns in both if is_auto]
-    if fault := next(filter(None, faults), ""):
-        times = "stamps of its images' headers" if by_header else "headers of its images are 0, the times of logging"
-        raise DriverError(
-            f"the {times} {fault}: expected those of one clock that runs on; cut the log there, or choose "
-            'log.time = "log", the times of logging, or "header"'
-        )
-    # 3. Where a header is unset, the time of logging with the usual delay counts.
-    header_ns, log_ns = both[0]
-    is_set = by_header & (header_ns > 0)
-    delay_ns = round(float(np.median((header_ns - log_ns)[is_set]))) if is_set.any() else 0
-    return StampRule(by_header, delay_ns, warnings)
-
-
-def _fault(times: Times, log_ns: Times) -> str:
-    """Return why times cannot be those at which a camera took its images; empty where they can.
-
-    The images are in the order of the file; a message that is there twice, logged at one time, counts once.
-    """
-    is_repeated = (np.diff(times, prepend=-1) == 0) & (np.diff(log_ns, prepend=-1) == 0)
-    times = times[~is_repeated & (times > 0)]
-    order, place, counts = np.unique(times, return_inverse=True, return_counts=True)
-    if len(order) < 2:
-        return ""
-    # An image behind the latest one must fill a hole: closer than half a period to others there is none.
-    behind_ns = np.maximum.accumulate(times) - times
-    steps_ns = np.diff(order)
-    step_ns = np.median(steps_ns)
-    if step_ns < _SHORTEST_STEP_NS:
-        return f"are {step_ns / 1000:g} us apart"
-    gaps_ns = np.concatenate([[np.inf], steps_ns, [np.inf]])
-    is_crowded = (np.minimum(gaps_ns[:-1], gaps_ns[1:]) <= step_ns / 2) | (counts > 1)
-    is_late = np.append(False, times[1:] < np.maximum.accumulate(times)[:-1])
-    wrong = np.flatnonzero((is_late & is_crowded[place]) | (behind_ns > _STEP_NS)).tolist()
-    return f"run back by {behind_ns[wrong[0]] * 1e-9:.3f} s at image {wrong[0] + 1}" if wrong else ""
+    for of_it in of_camera.values():
+        of_it = of_it & (header_ns >= 0)
+        steps_ns, is_repeated = np.diff(stamps_ns[of_it]), np.diff(log_ns[of_it]) == 0
+        wrong = np.flatnonzero((steps_ns < 0) | ((steps_ns == 0) & ~is_repeated)).tolist()
+        step_ns = np.median(steps_ns[steps_ns > 0]) if (steps_ns > 0).any() else _SHORTEST_STEP_NS
+        if wrong or step_ns < _SHORTEST_STEP_NS:
+            back = f"run back by {-steps_ns[wrong[0]] * 1e-9:.3f} s at image {wrong[0] + 2}" if wrong else ""
+            times = f"{'stamps of' if by_header else 'times of logging, as some are 0 in'} its images' headers"
+            raise DriverError(
+                f"the {times} {back or f'are {step_ns / 1000:g} us apart'}: expected those of one clock that runs on; "
+                'cut the log there, or choose log.time = "log", the times of logging, or "header"'
+            )
+    unset = np.count_nonzero(is_unset)
+    return stamps_ns, f"used the times of logging: the headers of {unset} images are 0" if unset else ""

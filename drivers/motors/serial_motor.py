@@ -25,8 +25,6 @@ from drivers.motors.protocols.motor_protocol import MotorProtocol, NoReplyError,
 
 SET_UP_S: Final = 0.2  # time for the answer to the setting-up: an ODrive needs 0.1 s
 POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
-FRESH_SHARE: Final = 0.5  # After a pause of this share of the watchdog's time it may expire before a command arrives.
-LONGEST_WAIT_S: Final = 2.0  # between two attempts to open the port, or to set up the controller
 _BUSY: Final = "it is in use by another program; see `fuser -v` with its name"
 _REASONS: Final = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
@@ -104,7 +102,7 @@ class SerialMotor:
         self._state = _State.GONE
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
-        self._waits, self._next_try_s = Backoff(LONGEST_WAIT_S), -math.inf
+        self._waits, self._next_try_s = Backoff(), -math.inf
         self._problem = ""  # why the last try failed
         next(self._protocol.connect(watchdog_ms))  # what no controller can be asked for is an error at once
         if connect_s:
@@ -177,7 +175,8 @@ class SerialMotor:
         if self._state is _State.GONE:
             self._port, self._state = _opened(self._name, self._baud), _State.SETTING_UP
         in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), max(SET_UP_S, self._timeout_s))
-        self._fresh_s = FRESH_SHARE * in_force_ms / 1000
+        # After a pause of half of the watchdog's time it may expire before a command arrives.
+        self._fresh_s = in_force_ms / 1000 / 2
         self._state = _State.STOP_FIRST
         self.connections += 1
 

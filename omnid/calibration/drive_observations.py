@@ -106,7 +106,7 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     landmarks = DriveLandmarks(place.model(config.odometry.noise_px))
     T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
     since = 0
-    with closing(cameras.reader(log, place.rig.topics)) as reader:
+    with closing(LogReader(log, cameras, place.rig.topics)) as reader:
         # Least number of pairs between two keyframes, so that there are `most` at most.
         apart = max(1, -(-(reader.pair_estimate() or 0) // most))
         for update in tracked_updates(reader, front_end, config, log):

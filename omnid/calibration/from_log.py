@@ -32,7 +32,7 @@ from calib import se3
 from calib.panorama import Cylinder, remap_tables
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
-from drivers.logs.log_reader import AnyCameras, LogCameras
+from drivers.logs.log_reader import AnyCameras, LogCameras, LogReader
 from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
@@ -177,7 +177,7 @@ def calibrate_mask(
     cameras = LogCameras(*topics)
     place = geometry(with_masks(log, rig, cameras), config.panorama)
     front_end, parts = FrontEnd(place, config), FixedParts(place.cylinder)
-    with closing(cameras.reader(log, rig.topics)) as reader:
+    with closing(LogReader(log, cameras, rig.topics)) as reader:
         for update in tracked_updates(reader, front_end, config, log):
             pair = update.depth.panoramas
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.errors import FrameDecodeError
 from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES, image_folders
-from drivers.logs.log_reader import LogCameras, LogReader
+from drivers.logs.log_reader import BY_NAME, LogCameras, LogReader
 from drivers.logs.open_log import is_log_name
 from omnid.errors import OmnidError
 
@@ -27,7 +27,6 @@ SIDES = ("lower", "upper")
 TOLERANCE_NS = 10_000_000
 # Number of pairs of a log that are used, evenly spread: a board held by hand moves little between two of them.
 LOG_PAIRS = 60
-BY_NAME = LogCameras()
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +56,7 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
         is_log |= has_folders or any(is_log_name(path.name) for path in source.iterdir())
     faults, topics = list[str](), ("", "")
     if is_log:
-        with closing(cameras.reader(source)) as reader:
+        with closing(LogReader(source, cameras)) as reader:
             sides = _of_log(reader, faults)
             topics = reader.topics["lower"], reader.topics["upper"]
     elif cameras.lower or cameras.upper:

@@ -13,7 +13,7 @@ import numpy as np
 from calib.fit.least_squares import ROUNDS
 from calib.fit.rig_drift import SHIFT_SIGMA_RAD, apply_drift
 from calib.rig import Rig
-from drivers.logs.log_reader import LogCameras
+from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import TOLERANCE_NS, spread_pairs
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import (
@@ -121,7 +121,7 @@ def read_rig_pairs(log: Path, rig: Rig, cameras: LogCameras) -> list[FramePair]:
     Cameras that are not synchronised are paired as in a run: within half a period.
     """
     decode, found = Decoder(rig), list[FramePair]()
-    with closing(cameras.reader(log, rig.topics)) as reader:
+    with closing(LogReader(log, cameras, rig.topics)) as reader:
         lower_ns = [frame.stamp_ns for frame in reader.frames() if frame.camera == "lower"]
         period_ns = float(np.median(np.diff(lower_ns))) if len(lower_ns) > 1 else 0.0
         for number, *frames in spread_pairs(reader, PAIRS, max(TOLERANCE_NS, period_ns / 2)):
@@ -149,5 +149,5 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
 
 def with_masks(log: Path, rig: Rig, cameras: LogCameras) -> Rig:
     """Return the rig with the masks of its mirrors, found in the images of a log where the rig has none."""
-    with closing(cameras.reader(log, rig.topics)) as reader:
+    with closing(LogReader(log, cameras, rig.topics)) as reader:
         return with_rims(rig, reader.frames())

@@ -157,8 +157,7 @@ def _below(path: Path) -> Iterator[Path]:
         yield path
         return
     inside = logs_in(path)
-    parts, gaps = parts_in_order(inside)
-    if len(parts) > 1 and not gaps:
+    if len(parts_in_order(inside)) > 1:
         yield path
         return
     # Links to folders are not followed: they may form circles.

@@ -21,7 +21,7 @@ from calib.models.names import model_in_words
 from calib.rig import Rig
 from calib.rig_file import png, read_rig, write_rig
 from calib.validation import silent
-from drivers.logs.log_reader import LogCameras
+from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
@@ -202,7 +202,7 @@ def drive(args: argparse.Namespace) -> int:
     if args.rig is not None:
         start = read_rig(args.rig)
     else:
-        with closing(log_cameras(args).reader(args.logs[0])) as reader:
+        with closing(LogReader(args.logs[0], log_cameras(args))) as reader:
             start = attached_rig(reader, args.logs[0])
     prepare_kernels()
     # 2. Check the rig, or adjust all of it.

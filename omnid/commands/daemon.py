@@ -18,7 +18,7 @@ from calib.rig_file import read_rig, rig_toml
 from calib.se2_arrays import transform
 from drivers.cameras.log_camera import LogCamera, LogImages, LogMotion, LogPlayback
 from drivers.frame import Camera
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, settings_of
 from omnid.commands.replay import replay_and_print
 from omnid.config import Config, unused_settings
@@ -79,7 +79,8 @@ def _settings(args: argparse.Namespace, more: Mapping[str, object] | None = None
 
 def _run_log(args: argparse.Namespace, config: Config) -> int:
     """Run on the images of a log, and on its wheels and gyro: no others fit these images."""
-    images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config), config.cameras.bits)
+    cameras = LogCameras(args.lower, args.upper, config.cameras.bits)
+    images = LogImages.load(args.log, cameras, motion_topics(config))
     for warning in images.warnings:
         log(logging.WARNING, warning)
     playbacks: list[LogPlayback] = []  # one for each time that both cameras are opened, the lower one first
@@ -94,7 +95,7 @@ def _run_log(args: argparse.Namespace, config: Config) -> int:
 
     rig = None
     if not args.rig:
-        with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+        with closing(LogReader(args.log, cameras)) as reader:
             rig = attached_rig(reader, args.log)
     run_live(config, ConnectedRobot(open_camera, open_motion), log, rig)
     return 0

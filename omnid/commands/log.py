@@ -9,14 +9,14 @@ from dataclasses import asdict
 
 import numpy as np
 
+from calib import se3
 from drivers.errors import DriverError
 from drivers.logs.log import Log
 from drivers.logs.open_log import open_log
-from omnid.commands.options import JSON, RATE, command, failed, print_entries, print_json, warn
+from omnid.commands.options import JSON, RATE, command, failed, print_entries, print_json
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.plain_text import plain, utc
-from omnid.recordings.evaluation import evaluate
-from omnid.recordings.truth_frame import find_truth_frame
+from omnid.recordings.evaluation import evaluate, turned_body
 
 BROKEN = "cut or corrupt"
 
@@ -27,7 +27,7 @@ def info(args: argparse.Namespace) -> int:
 
     Exit code 1: one is broken; 2: one is no log.
 
-    logs LOG...  .mcap, .mcap.part, .db3, .bag, or a folder of these or of images
+    logs LOG...  .mcap, .db3, .bag, or a folder of these or of images
 
     examples:
       log info recordings/*.mcap
@@ -87,36 +87,29 @@ def evaluate_run(args: argparse.Namespace) -> int:
     """Compare a trajectory with the truth, both in the TUM format.
 
     estimate EST           t x y z qx qy qz qw, T_odom_rig
-    truth TRUTH            the same format or EuRoC's CSV, of the same rig frame in any world frame
+    truth TRUTH            the same format, of the same rig frame in any world frame
     --tolerance-ms MS=10   largest difference between the stamps of two poses
-    --align origin|rigid|scale=origin  the first pose, as evo's --align_origin; rigid: all positions, as its --align;
-        scale: these and the estimate's scale, which is printed, as its --align --correct_scale
-    --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit the constant pose of another body, and
-        print it
+    --align origin|rigid=origin  the first pose, as evo's --align_origin; rigid: all positions, as its --align
+    --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit three angles by which its axes are turned, and
+        print them
 
     examples:
       eval est.txt truth.txt
-      eval est.txt imu_truth.csv --frame auto
+      eval est.txt imu_truth.txt --frame auto
       eval est.txt truth.txt --align rigid --json
     """
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
-    # The body of the truth; unasked, half of the drive must show a difference that halves the error of all of it.
-    is_fitted, middle = args.frame == "auto", len(estimate.stamps_ns) // 2
-    part = estimate if is_fitted else Trajectory(estimate.stamps_ns[:middle], estimate.T[:middle])
-    frame = find_truth_frame(part, truth)
-    of_rig = truth if frame is None else frame.rig_poses(truth)
-    truth = of_rig if is_fitted else truth
+    known: dict[str, object] = {}
+    if args.frame == "auto":
+        T_rig_body = turned_body(estimate, truth, tolerance_s)
+        truth = Trajectory(truth.stamps_ns, truth.T @ se3.inverse(T_rig_body))
+        turn_deg = np.rad2deg(se3.rotation_log(T_rig_body[:3, :3]))
+        known["turned_deg"] = [round(float(angle), 2) for angle in turn_deg]
     metrics = evaluate(estimate, truth, tolerance_s, args.align)
-    if frame is not None and not is_fitted:
-        error_m = evaluate(estimate, of_rig, tolerance_s, args.align).ate_rmse_m
-        if error_m < metrics.ate_rmse_m / 2:
-            warn(f"{args.truth}: {frame}: with that the position error is {1e3 * error_m:.1f} mm: --frame auto")
     if args.json:
-        known = {"fitted_frame": str(frame), "fitted_unknowns": frame.freedom} if frame and is_fitted else {}
         print_json(asdict(metrics) | known)
         return 0
-    if frame is not None and is_fitted:
-        print(f"{args.truth}: {frame}")
-        print(f"unknowns of it that were fitted to these poses: {frame.freedom}; the errors are optimistic")
+    if known:
+        print(f"the truth is of a body turned by {known['turned_deg']} deg: fitted, so the errors are optimistic")
     print(metrics)
     return 0

@@ -74,12 +74,13 @@ class RunCounters:
 
 
 def pair_loss(pairing: Synchronise, read: Mapping[str, int]) -> str:
-    """Return one line where more than a tenth of the pairs of a log is missing; else "".
+    """Return one line where more than a tenth of the pairs of a log is missing, or records of it are corrupt; else "".
 
     read: counts of its reader. Images of a faster camera that the other one has no partners for are no loss.
     """
-    unusable = read["broken"] + read["unreadable"] + read["duplicate"] - read["repeated"]
-    possible, made = round(pairing.possible + unusable / len(CAMERAS)), pairing.counts["pairs"]
+    if read["broken_records"]:
+        return "images may be missing: see what was lost"
+    possible, made = round(pairing.possible + read["broken"] / len(CAMERAS)), pairing.counts["pairs"]
     lost = possible - made
     return f"{lost} of {possible} pairs are missing: see what was lost" if lost > NOTABLE_SHARE * possible else ""
 

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.places.features import COLUMNS, ROWS
+from omnid.core.places.features import COLUMNS, DESCRIPTOR, ROWS
 from omnid.core.places.place_map import (
-    DESCRIPTOR,
     Link,
     PlaceFeatures,
     PlaceKeyframe,
@@ -65,20 +64,16 @@ def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
         np.savez(file, **dict[str, Any](arrays))
 
 
-def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMap, PlaceRig]:
-    """Return the map of a file and the rig by which it was made.
-
-    into: an empty map that is filled, whose bound holds as soon as a keyframe is added to it.
-    Raises OmnidError, in one line, for any file that is no whole map.
-    """
-    path, places = Path(path), PlaceMap() if into is None else into
+def read_places(path: str | Path) -> tuple[PlaceMap, PlaceRig]:
+    """Return the map of a file and the rig by which it was made; OmnidError for any file that is no whole map."""
+    path = Path(path)
     try:
         if path.exists() and not path.is_file():
             raise ValueError("it is no regular file")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in _ARRAYS}
         _check(arrays)
-        return places, _from_arrays(arrays, places)
+        return _from_arrays(arrays)
     except OSError as error:
         raise OmnidError(f"{path}: cannot read the map: {error.strerror or error}") from error
     except Exception as error:  # whatever zipfile and numpy raise for bytes that no omnid has written
@@ -109,8 +104,9 @@ def _to_arrays(places: PlaceMap, rig: PlaceRig) -> _Arrays:
     return arrays
 
 
-def _from_arrays(arrays: _Arrays, places: PlaceMap) -> PlaceRig:
-    """Fill an empty map; return the rig."""
+def _from_arrays(arrays: _Arrays) -> tuple[PlaceMap, PlaceRig]:
+    """Return the map and the rig of arrays."""
+    places = PlaceMap()
     head, keyframes, links = arrays["map"][0], arrays["keyframes"], arrays["links"]
     T_map_rect, T_odom_rect = _transforms(keyframes["T_map_rect"]), _transforms(keyframes["T_odom_rect"])
     ends = np.cumsum(keyframes["features"]).tolist()
@@ -130,7 +126,7 @@ def _from_arrays(arrays: _Arrays, places: PlaceMap) -> PlaceRig:
     places.dropped = int(head["dropped"])
     T_rig_rect, T_base_rig = (_transforms(arrays["map"][name])[0] for name in ("T_rig_rect", "T_base_rig"))
     cylinder = Cylinder(int(head["width"]), int(head["height"]), float(head["row0"]))
-    return PlaceRig(cylinder, float(head["baseline_m"]), T_rig_rect, T_base_rig, head["rig_hash"].decode())
+    return places, PlaceRig(cylinder, float(head["baseline_m"]), T_rig_rect, T_base_rig, head["rig_hash"].decode())
 
 
 def _transforms(upper: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -22,9 +22,6 @@ MARK_PX = 11  # size of marks and distance of labels
 SIDE_PX = 1400  # of an image, at most
 WHITE, BLACK, RED, BLUE, LIGHT_GREY = (255, 255, 255), (0, 0, 0), (0, 0, 190), (200, 100, 0), (205, 205, 205)
 _CELL_M = 0.05  # default voxel: at a finer scale cells are drawn as squares, not as scattered dots
-_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.5
-_LOW_M, _HIGH_M = -1.0, 1.5  # heights that are drawn, relative to the lower viewpoint
-NO_LOOPS: Array = np.zeros((0, 2, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +43,6 @@ class Sheet:
         corner = np.array([MARGIN_PX, MARGIN_PX + self.area_px[1] - 1])
         return np.asarray(np.rint(corner + (xy_m - self.low_m) * self.px_per_m * [1, -1]), dtype=np.int32)
 
-    def pixel(self, xy_m: Array) -> tuple[int, int]:
-        """Return image coordinates of a point (2,)."""
-        x, y = self.pixels(xy_m[None])[0].tolist()
-        return x, y
-
 
 @dataclass(frozen=True, slots=True)
 class Lines:
@@ -68,15 +60,15 @@ def drawn_heights(height_m: float) -> tuple[float, float]:
     height_m: of the viewpoint above the floor; less than LEAST_HEIGHT_M, as 0, where the rig does not state it.
     Lower surfaces are the floor: obstacles begin at 0.06 m (obstacles.scan.heights_m), and a voxel has 0.05 m.
     """
-    return (max(_LOW_M, 0.1 - height_m) if height_m >= LEAST_HEIGHT_M else _LOW_M), _HIGH_M
+    return max(-1.0, 0.1 - height_m if height_m >= LEAST_HEIGHT_M else -1.0), 1.5
 
 
 def plan_view(
     points: MapPoints,
     trajectory_xy: Array,
     *,
-    heights_m: tuple[float, float] = (_LOW_M, _HIGH_M),
-    loops_xy: Array = NO_LOOPS,
+    heights_m: tuple[float, float],
+    loops_xy: Iterable[Array] = (),
 ) -> Image:
     """Return a BGR image (H, W, 3) of the map's points between two heights [m], and the path (N, 2) [m] over it.
 
@@ -139,7 +131,7 @@ def draw_ends(image: Image, sheet: Sheet, start: Array, end: Array | None = None
     """Draw a circle with its name at the start of a path, and one that is filled at its end."""
     for point, name, inside in ((end, "end", BLACK), (start, "start", WHITE)):
         if point is not None:
-            x, y = sheet.pixel(point)
+            ((x, y),) = sheet.pixels(point[None]).tolist()
             cv2.circle(image, (x, y), MARK_PX - 2, BLACK, cv2.FILLED, cv2.LINE_AA)
             cv2.circle(image, (x, y), MARK_PX // 2, inside, cv2.FILLED, cv2.LINE_AA)
             write(image, name, (x, y - MARK_PX if name == "start" else y + 2 * MARK_PX))
@@ -167,7 +159,7 @@ def _draw_frame(image: Image, sheet: Sheet) -> None:
     longest_m = 2 * MARGIN_PX / sheet.px_per_m
     decade = 10.0 ** np.floor(np.log10(longest_m))
     bar_m = float(decade * max(digit for digit in (1, 2, 5) if digit * decade <= longest_m))
-    (left, bottom), (right, top) = sheet.pixel(sheet.low_m), sheet.pixel(sheet.high_m)
+    (left, bottom), (right, top) = sheet.pixels(np.stack([sheet.low_m, sheet.high_m])).tolist()
     cv2.rectangle(image, (left, top), (right, bottom), BLACK, 1)
     write(image, "x forward", ((left + right) // 2, bottom + 2 * MARK_PX))
     write(image, "y left", (left, top - MARK_PX))
@@ -182,16 +174,16 @@ def with_legend(image: Image, lines: Sequence[tuple[str, Colour, int]]) -> Image
     image = np.pad(image, ((0, gap_px), (0, 0), (0, 0)), constant_values=255)
     y = image.shape[0] - gap_px
     for name, colour, width_px in lines:
-        (width, height), _ = cv2.getTextSize(name, _FONT, _FONT_SCALE, 1)
-        cv2.line(image, (left, y), (left + 30, y), colour, width_px, cv2.LINE_AA)
-        cv2.putText(image, name, (left + 38, y + height // 2), _FONT, _FONT_SCALE, BLACK, 1, cv2.LINE_AA)
-        left += 38 + width + gap_px
+        cv2.line(image, (left, y), (left + gap_px, y), colour, width_px, cv2.LINE_AA)
+        left += 2 * gap_px + write(image, name, (left + gap_px + MARK_PX, y + MARK_PX // 2), is_centred=False)
     return image
 
 
-def write(image: Image, text: str, centre_bottom: tuple[int, int]) -> None:
-    """Write black text on white, centred above a point."""
-    (width, height), below = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
-    left, bottom = centre_bottom[0] - width // 2, centre_bottom[1]
-    cv2.rectangle(image, (left - 2, bottom - height - 1), (left + width + 2, bottom + below), WHITE, cv2.FILLED)
-    cv2.putText(image, text, (left, bottom), _FONT, _FONT_SCALE, BLACK, 1, cv2.LINE_AA)
+def write(image: Image, text: str, bottom: tuple[int, int], *, is_centred: bool = True) -> int:
+    """Write black text on white above a point, centred or to the right of it; return its width [px]."""
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.5
+    (width, height), below = cv2.getTextSize(text, font, scale, 1)
+    left, y = bottom[0] - (width // 2 if is_centred else 0), bottom[1]
+    cv2.rectangle(image, (left - 2, y - height - 1), (left + width + 2, y + below), WHITE, cv2.FILLED)
+    cv2.putText(image, text, (left, y), font, scale, BLACK, 1, cv2.LINE_AA)
+    return width

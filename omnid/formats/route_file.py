@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
@@ -13,6 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from drivers.logs.log import LATEST_NS
 from omnid.core.navigation.path import FARTHEST_M
 from omnid.core.navigation.requests import route_name
 from omnid.core.navigation.route import DECIMALS, MOST_POINTS, Route
@@ -20,7 +19,6 @@ from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_whole
 
-VERSION: Final = 1
 SUFFIX: Final = ".route.json"
 # Limit of what is read: the longest route that can be taught, of MOST_POINTS points, has less than 4 MB.
 MAX_BYTES: Final = 8 << 20
@@ -28,8 +26,8 @@ _PARTS: Final = ("x_m", "y_m", "yaw_rad")
 COLUMNS: Final = [*_PARTS, "speed_mps", "keyframe", *(f"in_keyframe_{part}" for part in _PARTS)]
 
 _Number: TypeAlias = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
-_Count: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
-_Keyframe: TypeAlias = Annotated[int, Meta(ge=NO_KEYFRAME, lt=1 << 62)]
+_Count: TypeAlias = Annotated[int, Meta(gt=NO_KEYFRAME, lt=LATEST_NS)]
+_Keyframe: TypeAlias = Annotated[int, Meta(ge=NO_KEYFRAME, lt=LATEST_NS)]
 # The COLUMNS.
 _Point: TypeAlias = tuple[_Number, _Number, _Number, _Number, _Keyframe, _Number, _Number, _Number]
 
@@ -62,7 +60,7 @@ def route_bytes(route: Route) -> bytes:
     points = [(*row[:4], int(row[4]), *row[5:]) for row in numbers.tolist()]
     keyframes = [(int(id), int(stamp)) for id, stamp in sorted(route.stamps_ns.items())]
     about = route.name, route.created_s, route.map_name
-    content = _Content("omnid route", VERSION, *about, COLUMNS, points, keyframes, crc32=0)
+    content = _Content("omnid route", 1, *about, COLUMNS, points, keyframes, crc32=0)
     content.crc32 = content.checksum()
     return _text(msgspec.structs.asdict(content)) + b"\n"
 
@@ -81,7 +79,7 @@ def parse_route(content: bytes, name: str) -> Route:
         points = numbers[:, :3], numbers[:, 3], keyframes, numbers[:, 5:]
         return Route(route_name(found.name), *points, dict(found.keyframes), found.created_s, found.map)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OmnidError) as error:
-        what = f"this is no route of version {VERSION}, or a damaged one"
+        what = "this is no route of version 1, or a damaged one"
         raise OmnidError(f"{name}: {what}: {error}: teach it again") from None
 
 
@@ -99,15 +97,15 @@ class RouteFolder:
         """Return the names of all routes, sorted."""
         return sorted(path.name.removesuffix(SUFFIX) for path in self.folder.glob(f"[!.]*{SUFFIX}"))
 
-    def has(self, name: str) -> bool:
-        """True if there is a file for a route of that name, readable or not."""
-        return self.path(name).exists()
-
     def read(self, name: str) -> Route:
         """Return a route. Raise OmnidError where there is none, or where its file is damaged."""
         path = self.path(name)
-        with self._reported(path, "read the route"), path.open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
+        try:
+            with path.open("rb") as file:
+                content = file.read(MAX_BYTES + 1)
+        except OSError as error:
+            known = ", ".join(self.names()[:20]) or "none"
+            raise OmnidError(f"{path}: cannot read the route: {error.strerror}; routes there: {known}") from None
         route = parse_route(content, str(path))
         if route.name != name:
             raise OmnidError(f"{path}: this is the route {route.name}: name the file {route.name}{SUFFIX}")
@@ -115,15 +113,8 @@ class RouteFolder:
 
     def write(self, route: Route) -> None:
         """Write a route; one of the same name is replaced. Raise OmnidError where it cannot be written."""
-        with self._reported(self.folder, "make the folder of the routes; change navigation.routes"):
-            self.folder.mkdir(parents=True, exist_ok=True)
-        write_whole(self.path(route.name), route_bytes(route))
-
-    @contextmanager
-    def _reported(self, path: Path, action: str) -> Iterator[None]:
-        """Turn what the disk reports into OmnidError, which names the routes that are there."""
         try:
-            yield
+            self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            known = ", ".join(self.names()[:20]) or "none"
-            raise OmnidError(f"{path}: cannot {action}: {error.strerror or error}; routes there: {known}") from None
+            raise OmnidError(f"{self.folder}: cannot make the folder of navigation.routes: {error.strerror}") from None
+        write_whole(self.path(route.name), route_bytes(route))

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame
-from drivers.logs.log import Log, listed
+from drivers.logs.log import listed
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.errors import OmnidError
@@ -41,29 +41,6 @@ IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # i
 Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | Frame
 
 
-def choose_odometry_topic(log: Log, topic: str | None, robot: str | None) -> str:
-    """Return the topic of the poses: one that is named, else the only one of its type, else the only `.../odom`.
-
-    topic: the full name, such as /omnid/odom; robot: stands for /<robot>/odom. Raise OmnidError where there is no
-    such topic, or several and none is named.
-    """
-    counts = log.counts()
-    known = [name for name, schema in sorted(log.topics.items()) if schema == ODOMETRY_SCHEMA and counts[name]]
-    if topic is None and robot is not None:
-        topic = f"/{robot.strip('/')}/{ODOMETRY}"
-    if topic is not None:
-        found = [topic] if topic in known else []
-    else:
-        found = known if len(known) == 1 else [name for name in known if name.endswith(f"/{ODOMETRY}")]
-    if len(found) == 1:
-        return found[0]
-    wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}" if topic else f"{len(known) or 'no'} topics of {ODOMETRY_SCHEMA}"
-    raise OmnidError(
-        f"{log.path}: {wrong}: found {listed(known or log.topics, 'none')}; name one by --topic, or make a recording "
-        f"by `omnid replay {log.path} --record out.mcap`"
-    )
-
-
 class RecordedMessage(NamedTuple):
     """A decoded message; name: last part of its topic, one of the constants above or of omnid.transport.topics."""
 
@@ -73,16 +50,35 @@ class RecordedMessage(NamedTuple):
 
 
 class RecordingReader:
-    """Reads the messages of one robot of a log, the one with the odometry topic (see choose_odometry_topic).
+    """Reads the messages of one robot of a log: the one whose poses are on a topic of nav_msgs/msg/Odometry.
 
-    log: closed by close(). unreadable: messages left out, by topic: not of their type, or not finite; complete once all
-    messages are read.
+    log: closed by close(). topic: of the poses; robot: its name, the topic without its last part, or all of it where it
+    has only one. unreadable: messages left out, by topic: not of their type, or not finite; complete once all messages
+    are read.
     """
 
     def __init__(self, path: Path, topic: str | None = None, robot: str | None = None) -> None:
-        """topic, robot: of the odometry. Raise DriverError without a log, OmnidError without odometry in it."""
+        """topic: of the poses, such as /omnid/odom; robot: stands for /<robot>/odom.
+
+        Without both, it is the only topic of its type, else the only `.../odom`. Raise DriverError without a log,
+        OmnidError where there is no such topic, or several and none is named.
+        """
         self.log, self.unreadable = open_log(path), Counter[str]()
-        self.topic = choose_odometry_topic(self.log, topic, robot)
+        counts, topics = self.log.counts(), self.log.topics
+        known = [name for name, schema in sorted(topics.items()) if schema == ODOMETRY_SCHEMA and counts[name]]
+        named = topic or (f"/{robot.strip('/')}/{ODOMETRY}" if robot else None)
+        found = [name for name in known if named in (None, name)]
+        if len(found) > 1:
+            found = [name for name in found if name.endswith(f"/{ODOMETRY}")]
+        if len(found) != 1:
+            wrong = f"no {ODOMETRY_SCHEMA} on {named!r}" if named else f"{len(known)} topics of {ODOMETRY_SCHEMA}"
+            raise OmnidError(
+                f"{path}: {wrong}: found {listed(known or topics, 'none')}; name one by --topic, or make a recording "
+                f"by `omnid replay {path} --record out.mcap`"
+            )
+        (self.topic,) = found
+        self._prefix = self.topic.rpartition("/")[0]
+        self.robot = self._prefix.strip("/") or self.topic
 
     def close(self) -> None:
         """Close the log; may be called twice."""
@@ -91,27 +87,15 @@ class RecordingReader:
     def no_pose(self) -> OmnidError:
         """Return the error for a log whose topic of the poses has none that can be read."""
         path = self.log.path
-        return OmnidError(
-            f"{path}: topic {self.topic!r} has no readable pose; `omnid log info {path}` reports whether the log is "
-            "complete"
-        )
-
-    @property
-    def robot(self) -> str:
-        """Name of the robot: the odometry topic without its last part, or all of it where it has only one."""
-        return self.topic.rpartition("/")[0].strip("/") or self.topic
-
-    def topic_name(self, name: str) -> str:
-        """Return the full name of a topic from its last part."""
-        return self.topic if name == ODOMETRY else f"{self.topic.rpartition('/')[0]}/{name}"
+        return OmnidError(f"{path}: topic {self.topic!r} has no readable pose; `omnid log info {path}` checks the log")
 
     def image_name(self) -> str:
         """Return the name of the robot's preferred images, "" where there are none."""
-        return next((name for name in IMAGES if self.topic_name(name) in self.log.topics), "")
+        return next((name for name in IMAGES if f"{self._prefix}/{name}" in self.log.topics), "")
 
     def messages(self, names: Iterable[str]) -> Iterator[RecordedMessage]:
         """Yield the messages of topics with these names."""
-        wanted = {self.topic_name(name): name for name in names if name}
+        wanted = {self.topic if name == ODOMETRY else f"{self._prefix}/{name}": name for name in names if name}
         for message in self.log.messages(wanted.keys()):
             name = wanted[message.topic]
             kind, decode = DECODERS.get(name, ("", None))
@@ -138,6 +122,6 @@ def _finite_twist(data: bytes) -> TwistRecord:
 
 # Type and decoder of each topic.
 DECODERS: Final[Mapping[str, tuple[str, Callable[[bytes], Content]]]] = {
-    **{name: PUBLISHED[name][:2] for name in (ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN)},
+    **{name: (PUBLISHED[name].schema, PUBLISHED[name].decode) for name in (ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN)},
     **dict.fromkeys((DRIVE, TWIST_COMMAND), (TWIST_SCHEMA, _finite_twist)),
 }

@@ -79,7 +79,7 @@ class RecordedRun:
     """
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
-        """Read a recording; topic: of the odometry, see choose_odometry_topic.
+        """Read a recording; topic: of the odometry, see RecordingReader.
 
         Raise OmnidError where there is no odometry in it, DriverError where there is no log.
         """

@@ -66,7 +66,7 @@ class RunPlaces:
         if self._is_extended and not path.exists():
             log(logging.INFO, f"{path.name}: there is no such map: this run begins a new one")
         elif self.places is not None:
-            self.places, rig = read_places(path, self.places)
+            self.places, rig = read_places(path)
             if difference := rig.difference(self._rig):
                 raise OmnidError(
                     f"{path}: this map was made with {difference}: build one with this rig, by `omnid map build`"

@@ -125,7 +125,7 @@ class RunResult:
         """Return the errors of the poses against a true trajectory, as `omnid eval` prints them.
 
         truth: a TUM file, or a Trajectory of T_world_rig. tolerance_s: largest difference of the stamps of two poses.
-        alignment: "origin" (the first poses coincide), "rigid" or "scale" (all positions do, least squares).
+        alignment: "origin" (the first poses coincide), or "rigid" (all positions do, least squares).
 
         Raises OmnidError for a file that cannot be read and for fewer than two poses at the same times.
         """
@@ -172,7 +172,8 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         session = Session(config, graph, closing, warnings.append)
         given = read_rig(options.rig) if isinstance(options.rig, Path) else options.rig
         cameras = LogCameras(*options.topics, config.cameras.bits, config.log.rate_hz, config.log.time)
-        reader = cameras.reader(log, given.topics if given else ("", ""), options.span_s, motion_topics(config))
+        topics = given.topics if given else ("", "")
+        reader = LogReader(log, cameras, topics, span_s=options.span_s, motion=motion_topics(config))
         closing.callback(reader.close)
         geometry = session.geometry(given or attached_rig(reader, log), reader.frames())
         prepare_kernels()

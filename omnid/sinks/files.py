@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
@@ -18,7 +18,7 @@ from drivers.logs.mcap_writer import is_locked, lock
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_whole
-from omnid.formats.plan import NO_LOOPS, plan_view
+from omnid.formats.plan import plan_view
 from omnid.formats.tum import tum_row
 from omnid.messages import OdometryUpdate
 
@@ -126,7 +126,7 @@ def write_plan(
     points: MapPoints,
     path_xy: NDArray[np.float64],
     heights_m: tuple[float, float],
-    loops_xy: NDArray[np.float64] = NO_LOOPS,
+    loops_xy: Iterable[NDArray[np.float64]] = (),
 ) -> None:
     """Write the plan view of points between two heights [m], as `plan_view` draws it. Raises OmnidError."""
     image = plan_view(points, path_xy, heights_m=heights_m, loops_xy=loops_xy)

@@ -115,7 +115,7 @@ class Recorder:
 
     def stats(self) -> dict[str, object]:
         """Return the state of the files, with counts of all that was lost after the inbox."""
-        state, names = self.state, ("file", "messages", "lost", "files", "deleted")
+        state, names = self.state, ("messages", "lost", "files", "deleted")
         counts = {name: getattr(state, name) for name in names} | {"invalid": self.invalid}
         return {**counts, "state": state.status, "problem": state.problem}
 

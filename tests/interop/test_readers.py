@@ -9,12 +9,14 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
 from rosbags.highlevel import AnyReader
 
 from calib import se3
@@ -38,11 +40,11 @@ NOT_FINITE = {"nan": "NaN", "inf": "Infinity", "-inf": "-Infinity"}  # JavaScrip
 Expected = dict[str, list[dict[str, Any]]]  # topic -> its messages, in order
 
 
-def write_known(path: Path, compression: Any = "lz4") -> Expected:
+def write_known(path: Path, compression: CompressionType = CompressionType.LZ4) -> Expected:
     """Write the log with omnid's own writers and return its expected content."""
     numbers = np.random.default_rng(5)
     expected: Expected = {}
-    with LogWriter(path, ATTACHED, compression=compression) as log:
+    with closing(LogWriter(path, ATTACHED, compression=compression)) as log:
         for stamp_ns in range(START_NS, START_NS + COUNT * PERIOD_NS, PERIOD_NS):
             for topic, schema, data in _messages(stamp_ns, numbers):
                 log.write(topic, schema, data, stamp_ns)
@@ -165,7 +167,7 @@ class Known(NamedTuple):
     expected: Expected
 
 
-@pytest.fixture(scope="session", params=("lz4", "none"))
+@pytest.fixture(scope="session", params=(CompressionType.LZ4, CompressionType.NONE), ids=["lz4", "none"])
 def known(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Known:
     """A log of known numbers, with chunks as `--record` and as `omnid run` writes them."""
     path = tmp_path_factory.mktemp("known") / f"{request.param}.mcap"

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import LogCameras, LogReader
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 
 PERIOD_NS = 100_000_000
@@ -37,7 +37,7 @@ class Image:
 
 def images(log: Path, lower: str | None = None, upper: str | None = None) -> list[Image]:
     """Return the images of a log, in the order of their stamps; lower, upper: topics, None: by their names."""
-    reader = LogReader(log, lower, upper)
+    reader = LogReader(log, LogCameras(lower, upper))
     taken = [Image(f.camera, f.seq, f.stamp_ns, bytes(f.data), f.stamp_ns) for f in reader.frames()]
     reader.close()
     return taken

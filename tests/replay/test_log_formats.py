@@ -75,7 +75,6 @@ def test_loss_is_told_by_the_exit_code(omnid: Command, tmp_path: Path, scene: Pa
 
 @pytest.mark.parametrize("kind", ["lz4", "bag"])
 def test_images_in_corrupt_chunks_are_a_loss(omnid: Command, tmp_path: Path, scene: Path, kind: str) -> None:
-    """Of a chunk that does not unpack, the summary of the file tells what was in it."""
     if kind == "bag":
         log = write_bag(tmp_path / "log.bag", entries(scene), "BZ2", chunk_bytes=30_000)
     else:
@@ -86,7 +85,7 @@ def test_images_in_corrupt_chunks_are_a_loss(omnid: Command, tmp_path: Path, sce
     log.write_bytes(data)
     result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
     assert result.code == 1 and "skipped 4 corrupt chunks" in result.err
-    assert re.search(r"\d of 24 pairs are missing", result.err)
+    assert "images may be missing" in result.err
 
 
 def test_a_camera_of_half_the_rate_loses_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,7 +110,7 @@ def test_a_file_that_another_run_writes_is_no_output(omnid: Command, tmp_path: P
         assert all("another program is writing it" in error for error in errors())
         yield np.eye(4)
 
-    with LogWriter(mcap):
+    with closing(LogWriter(mcap)):
         write_trajectory(tum, np.arange(2), poses())  # type: ignore[arg-type]
     assert len(rows(tum)) == 2 and omnid("log", "info", mcap).code == 0
     assert omnid.replay(scene / "log.mcap", "--tum", tum, "--seconds", 0.1, rig=scene / "rig.toml").code == 0

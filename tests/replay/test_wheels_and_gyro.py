@@ -116,7 +116,7 @@ def test_broken_messages_and_topics_that_are_not_clear_are_reported(
     reader = LogReader(log, motion=MotionTopics())
     list(reader.messages())
     assert "several topics of sensor_msgs/msg/Imu" in reader.warnings[0] and "motion.imu" in reader.warnings[0]
-    with pytest.raises(DriverError, match=r"'/nothing' is not in .*motion\.wheels must be one of nav_msgs"):
+    with pytest.raises(DriverError, match=r"'/nothing' is no topic of nav_msgs.*motion\.wheels must be one"):
         LogReader(log, motion=MotionTopics(wheels="/nothing"))
 
 

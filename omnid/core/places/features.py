@@ -31,6 +31,7 @@ Thumbnail = NDArray[np.int8]
 FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
 # Samples along a side of a patch, cells along a side, directions of the gradient in each cell; as in SIFT (Lowe 2004).
 SAMPLES, CELLS, BINS = 16, 4, 8
+DESCRIPTOR: Final = CELLS * CELLS * BINS  # bytes
 LARGEST: Final = 0.2  # Limit of a histogram's entries, of one of length 1 (Lowe 2004).
 SCALE: Final = 512.0  # Factor on the square roots of a descriptor's shares, so that they fill a byte.
 
@@ -54,7 +55,7 @@ def describe_patches(panorama: PaddedPanorama, pixels: Array, sides_px: Array) -
     They are the square roots of the histograms' shares (RootSIFT: Arandjelovic and Zisserman 2012), in bytes.
     """
     if not len(pixels):
-        return np.zeros((0, CELLS**2 * BINS), np.uint8)
+        return np.zeros((0, DESCRIPTOR), np.uint8)
     # 1. Lengths and directions (0 to BINS) of the gradients of the samples (N, SAMPLES, SAMPLES).
     patches = _patches(panorama, pixels, sides_px)
     dx = patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]

@@ -18,7 +18,6 @@ from omnid.core.places.pose_graph import connected
 Array = NDArray[np.float64]
 
 NO_KEYFRAME: Final = -1  # Used in place of an id, because ids are never negative.
-DESCRIPTOR: Final = 128  # Bytes of a descriptor; exact: 8 directions in 4 x 4 cells.
 # A map is of the same rig where baseline, shift [m] and turn [rad] of the rectified frame differ by less than this: the
 # rig may have been calibrated again.
 BASELINE_RATIO, SHIFT_M, TURN_RAD = 0.01, 0.01, 0.02

@@ -8,6 +8,7 @@ import math
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -328,7 +329,7 @@ def cloud(pose: float, points: np.ndarray, frame: str = "odom") -> Entry:
 
 def save(path: Path, entries: Iterable[Entry], attachments: dict[str, bytes] | None = None) -> Path:
     """Write a log of these messages in their order and return its path."""
-    with LogWriter(path, attachments) as log:
+    with closing(LogWriter(path, attachments)) as log:
         for stamp_ns, topic, schema, payload in entries:
             log.write(topic, schema, payload, stamp_ns)
     return path

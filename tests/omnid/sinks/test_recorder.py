@@ -205,10 +205,10 @@ def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: p
 def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, clock=set_clock())
-    assert (entry(RECORDING, recorder.stats()).level, entry(RECORDING, recorder.stats()).message) == (OK, "waiting")
+    assert (entry(RECORDING, recorder.stats()).level, entry(RECORDING, recorder.stats()).message) == (OK, "recording")
     recorder.process(frame(0, "lower"))
     status = entry(RECORDING, recorder.stats())
-    assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
+    assert status.message == "recording" and status.values["messages"] == status.values["files"] == "1"
     recorder.close()
     full = replace(config, record=replace(config.record, free_mb=1_000_000))
     recorder = open_recorder(full, "", lambda *_: None, clock=set_clock())

@@ -16,7 +16,7 @@ import omnid
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame, gray
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import LogCameras, LogReader
 from drivers.motion import GyroSample, WheelSample
 from omnid.config import PairConfig
 from omnid.messages import FramePair
@@ -245,7 +245,7 @@ def test_a_drifted_rig_is_reported_and_motion_is_not(skewed: tuple[Path, Rig], t
 def test_images_with_both_stamps_give_the_poses_of_a_replay(skewed: tuple[Path, Rig]) -> None:
     log, rig = skewed
     expected = omnid.replay(log, rig)
-    found = list(LogReader(log, *rig.topics).frames())
+    found = list(LogReader(log, LogCameras(*rig.topics)).frames())
     frames = {name: [frame for frame in found if frame.camera == name] for name in ("lower", "upper")}
     odometry, blind = omnid.Odometry(rig), omnid.Odometry(rig)
     for number, (lower, upper) in enumerate(zip(frames["lower"], frames["upper"], strict=True)):
