@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
+from difflib import get_close_matches
 from importlib import import_module
 from itertools import dropwhile, takewhile
 from operator import methodcaller
@@ -31,11 +32,11 @@ class Entry(NamedTuple):
 # Words of each command that has no subcommands -> its entry. A module is imported when its command is named.
 COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
     {
-        "run": Entry("daemon", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
-        "simulate": Entry("daemon:simulate", "the daemon with a simulated robot in a simulated world"),
-        "replay": Entry("replay", "run a recorded log through the stages of the daemon"),
-        "demo": Entry("daemon:demo", "replay a sample in real time: files, bus and a simulated motor"),
-        "eval": Entry("log:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
+        "run": Entry("runs", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
+        "simulate": Entry("runs:simulate", "the daemon with a simulated robot in a simulated world"),
+        "replay": Entry("runs:replay", "run a recorded log through the stages of the daemon"),
+        "demo": Entry("runs:demo", "replay a sample in real time: files, bus and a simulated motor"),
+        "eval": Entry("recordings:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
         "calibrate live": Entry("calibrate:live", "images of a board, with its coverage and what is missing"),
         "calibrate rig": Entry("calibrate:of_board", "a rig.toml from images of a board that both cameras saw"),
         "calibrate drive": Entry("calibrate:drive", "what drives say about a rig, and the rig that they make"),
@@ -50,18 +51,18 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "route teach": Entry("robot:teach", "record a route while somebody drives (`omnid drive`, a joystick)"),
         "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
         "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
-        "route list": Entry("map:list_routes", "the routes in navigation.routes, here"),
+        "route list": Entry("robot:list_routes", "the routes in navigation.routes, here"),
         "listen": Entry("machine:listen", "show pose, state, rates and latencies of a robot"),
-        "view": Entry("view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
+        "view": Entry("recordings:view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
         "web": Entry("machine:web", "a page with state, path, warnings, stop and arm"),
         "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
-        "record": Entry("daemon:record", "record both cameras to MCAP files until Ctrl-C"),
-        "report": Entry("view:report", "one HTML page about a recording: path, events, statistics"),
-        "log info": Entry("log:info", "topics, types, counts, times, attachments, and whether the log is whole"),
+        "record": Entry("runs:record", "record both cameras to MCAP files until Ctrl-C"),
+        "report": Entry("recordings:report", "one HTML page about a recording: path, events, statistics"),
+        "log info": Entry("recordings:info", "topics, types, counts, times, attachments, and whether the log is whole"),
         "map build": Entry("map:build", "build a map from logs, of one drive or of several in the same place"),
         "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map"),
         "map export": Entry("map:export", "write a map for other programs"),
-        "map save": Entry("map:save", "ask a robot to save its map now, before it is switched off"),
+        "map save": Entry("robot:save_map", "ask a robot to save its map now, before it is switched off"),
         "doctor": Entry("machine:doctor", "check cameras, motor, rig, rights, bus and disk"),
         "motor test": Entry("machine:test_motor", "turn each wheel, ask what moved, print the settings for that"),
         "config": Entry("machine:print_config", "print or check settings"),
@@ -86,7 +87,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the error and end the program."""
-        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}: see {self.prog} --help\n")
+        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}; see {self.prog} --help\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -103,7 +104,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     with ExitStack() as handlers:  # of the time in which modules are loaded, when nothing is to be ended
         with suppress(ValueError):  # outside the main thread signals stay as they are
             handlers.enter_context(handle_stop_signals(lambda number, _: os._exit(128 + number)))
-        args = parser_of(words).parse_args(words)
+        args, unknown = parser_of(words).parse_known_args(words)
+        if unknown:
+            names = [name.lstrip("-") for action in args.parser._actions for name in action.option_strings]
+            near = get_close_matches(unknown[0].lstrip("-").partition("=")[0], names, 1)
+            hint = f", did you mean --{near[0]}?" if near else ""
+            args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         from calib.errors import CalibError
         from drivers.errors import DriverError
         from omnid.engine.logging_setup import configure_logging, log

@@ -7,7 +7,6 @@ last, at once: a folder without it is done again.
 from __future__ import annotations
 
 import argparse
-import glob
 import json
 import logging
 import os
@@ -26,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.atomic_file import write_file
-from omnid.commands.options import CAMERAS, FILE_AND_SET, command, settings_of
+from omnid.commands.options import CAMERAS, FILE_AND_SET, command, require, settings_of
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line, plain
@@ -54,7 +53,7 @@ class Job:
 def run(args: argparse.Namespace) -> int:
     """Replay many logs; goes on where it was interrupted (extra `fleet`). Exit code 1: a log failed.
 
-    logs LOG...            files, folders, or patterns in quotes
+    logs LOG...            files or folders
     --out DIR              a folder for each log with its result.json (required)
     --rig FILE             the rig.toml of all logs; default: that attached to each
     --truth NAME=truth.txt  trajectory beside each log, which is compared where it exists
@@ -64,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
     examples:
       batch logs/ --out results --rig rig.toml
-      batch 'logs/2026-*/*.mcap' --out results --jobs 2
+      batch logs/2026-*/*.mcap --out results --jobs 2
       batch logs/ --out results --scheduler tcp://HOST:8786
     """
     jobs = _jobs(args)
@@ -73,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{len(results)} of {len(jobs)} logs have their results already", file=sys.stderr)
     with _client(args.scheduler, args.jobs or os.cpu_count() or 1) as client:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        futures = {client.submit(replay, job, pure=False, retries=1): job for job in jobs if job not in results}
+        futures = {client.submit(replay, job, pure=False): job for job in jobs if job not in results}
         try:
             for future in import_module("distributed").as_completed(futures, raise_errors=False):
                 is_done, job = future.status == "finished", futures[future]
@@ -90,16 +89,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def replay(job: Job) -> dict[str, Any]:
-    """Replay a log, compare it with its truth, and return what its JSON holds; run by a worker.
-
-    Raise RuntimeError where the program was killed, so that dask tries once more.
-    """
+    """Replay a log, compare it with its truth, and return what its JSON holds; run by a worker."""
     started_s = time.monotonic()
     shutil.rmtree(job.folder, ignore_errors=True)
     job.folder.mkdir(parents=True)
     code, summary = _omnid(job.words, job)
-    if code < 0:
-        raise RuntimeError(f"{job.log}: the program was ended by signal {-code}")
     status, error = DONE.get(code, "failed"), ""
     if code not in DONE:
         lines = (job.folder / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
@@ -133,8 +127,7 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
     given = [f"--{name}={path.absolute()}" for name in ("rig", "config") if (path := vars(args)[name])]
     given += [f"--{name}={topic}" for name in ("lower", "upper") if (topic := vars(args)[name])]
     given += [f"--set={value}" for value in args.set] + OUTPUTS
-    named = [Path(path) for name in map(str, args.logs) for path in glob.glob(name, recursive=True) or [name]]
-    logs = sorted({Path(os.path.abspath(log)) for path in named for log in _below(path)})
+    logs = sorted({Path(os.path.abspath(log)) for path in args.logs for log in _below(path)})
     if not logs:
         raise OmnidError(f"batch: no log in {', '.join(map(str, args.logs))}")
     common = os.path.commonpath([log.parent for log in logs])
@@ -178,10 +171,8 @@ def _stored(job: Job) -> dict[str, Any] | None:
 
 def _client(scheduler: str | None, jobs: int) -> Any:
     """Return a client of an existing scheduler, or of threads in this process, each of which waits for programs."""
-    try:
-        distributed = import_module("distributed")
-    except ImportError as error:
-        raise OmnidError(f"batch needs dask.distributed: install the extra `fleet` into {sys.prefix}") from error
+    require("fleet", "distributed")
+    distributed = import_module("distributed")
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # each connection and repetition is told
     if not scheduler:
         # dask has web servers in any case, by default for all machines of the network.

@@ -29,17 +29,7 @@ from omnid.calibration.images import SIDES, read_pairs
 from omnid.calibration.live_boards import LiveBoards, newest_pairs, status
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.rig_check import check_log, with_upper_corrected
-from omnid.commands.options import (
-    HEIGHT,
-    LOG_CAMERAS,
-    QUIET,
-    SETTINGS,
-    command,
-    device_opener,
-    failed,
-    settings_of,
-    warn,
-)
+from omnid.commands import options
 from omnid.core.rig.column_finding import RigState
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER
@@ -76,7 +66,7 @@ def board_of(args: argparse.Namespace) -> AnyBoard:
     return Board(columns, rows, args.square_mm / 1e3)
 
 
-@command(BOARD, LOG_CAMERAS, HEIGHT, QUIET)
+@options.command(BOARD, options.LOG_CAMERAS, options.HEIGHT, options.QUIET)
 def of_board(args: argparse.Namespace) -> int:
     """Make a rig.toml from images of a board that both cameras saw at once.
 
@@ -95,9 +85,8 @@ def of_board(args: argparse.Namespace) -> int:
       calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml
     """
     board = board_of(args)
-    named = [("--output", args.output), ("--report", args.report)]
-    read = [("a file that is read", args.images)]
-    check_outputs([(name, path) for name, path in named if path is not None], read)
+    reports = [("--report", args.report)] if args.report else []
+    check_outputs([("--output", args.output), *reports], [("a file that is read", args.images)])
     expected_mm = args.expected_baseline_mm
     found = calibrate_rig(
         args.images,
@@ -112,7 +101,7 @@ def of_board(args: argparse.Namespace) -> int:
     if args.report:
         found.save_report(args.report)
     for line in found.warnings:
-        warn(line)
+        options.warn(line)
     for line in found.tables:
         print(line)
     print(f"{args.output}: {found}")
@@ -120,7 +109,7 @@ def of_board(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(BOARD, SETTINGS)
+@options.command(BOARD, options.SETTINGS)
 def live(args: argparse.Namespace) -> int:
     """Search the board in the images of both cameras as they come.
 
@@ -136,7 +125,7 @@ def live(args: argparse.Namespace) -> int:
     examples:
       calibrate live boards/ --corners 6x7 --square-mm 30 --config /etc/omnid/omnid.toml
     """
-    config, folder, published_s = settings_of(args), args.images, 0.0
+    config, folder, published_s = options.settings_of(args), args.images, 0.0
     with closing(LiveBoards(board_of(args))) as boards:
         # 1. What is in the folder.
         folder.mkdir(parents=True, exist_ok=True)
@@ -147,7 +136,7 @@ def live(args: argparse.Namespace) -> int:
                 boards.process((read.sides[0][name], read.sides[1][name]), need_still=False)
         number = max((int(name) for name in names[0] | names[1] if name.isascii() and name.isdigit()), default=0)
         # 2. Pairs of the cameras until Ctrl-C.
-        open_camera = device_opener(config)
+        open_camera = options.device_opener(config)
         with (
             closing(open_camera("lower")) as lower,
             closing(open_camera("upper")) as upper,
@@ -160,27 +149,23 @@ def live(args: argparse.Namespace) -> int:
                     number += 1
                     for side, image in zip(SIDES, pair, strict=True):
                         write_file(folder / f"{side}_{number:03d}.png", png(image))
-                if sys.stdout.isatty():  # one line, which the next one replaces
-                    HANDLER.show(f"{boards.pairs} ({outcome}): {missing}")
-                elif outcome == "kept":
-                    print(f"{boards.pairs}: {missing}", flush=True)
+                HANDLER.show(f"{boards.pairs} ({outcome}): {missing}")
                 if time.monotonic() >= published_s + config.live.status_s:
                     published_s = time.monotonic()
                     bus.publish("status", diagnostics_cdr(time.time_ns(), [status(boards, outcome)]))
     HANDLER.show("")
     if missing := "; ".join(boards.missing()):
-        return failed(f"{boards.pairs} pairs, not enough yet: {missing}")
+        return options.failed(f"{boards.pairs} pairs, not enough yet: {missing}")
     print(f"{boards.pairs} pairs, enough: `omnid calibrate rig {folder}` with the same options of the board")
     return 0
 
 
-@command(LOG_CAMERAS, HEIGHT)
+@options.command(options.LOG_CAMERAS, options.HEIGHT)
 def drive(args: argparse.Namespace) -> int:
     """Adjust all parameters of a rig to drives with turns, without a board.
 
     Then find the height of the cameras, if the rig states none, and what is fixed to them, where the first log shows
-    it. Exit code 1: the rig has drifted (--only check), the ruler contradicts, or nothing was found that could be
-    written.
+    it. Exit code 1: the rig has drifted (--only check), or nothing was found that could be written.
 
     logs LOG...        drives with turns; 100 to 350 pairs
     --rig FILE         the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images,
@@ -220,10 +205,10 @@ def drive(args: argparse.Namespace) -> int:
         if not adjusted.is_better:
             print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
         elif adjusted.is_misfit:
-            warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
+            options.warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
         rig = adjusted.rig if adjusted.is_better else rig
     # 3. Find the height, and the masks; a log that shows none of them is no error but for --only.
-    rig, contradiction = _at_height(args, rig)
+    rig = _at_height(args, rig)
     if not args.only or "mask" in args.only:
         try:
             mask = calibrate_mask(args.logs[0], rig, topics)
@@ -234,8 +219,6 @@ def drive(args: argparse.Namespace) -> int:
                 raise
             print(error)
     # 4. Write the rig.
-    if contradiction:
-        return failed(f"{contradiction}; nothing was written")
     if args.output is not None and rig is start:
         print("nothing was written")
     elif args.output is not None:
@@ -245,34 +228,33 @@ def drive(args: argparse.Namespace) -> int:
     return 0 if is_found and not has_drifted else 1
 
 
-def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
-    """Return the rig with the height that is given, or else by the floor, and how the ruler contradicts it ("").
+def _at_height(args: argparse.Namespace, rig: Rig) -> Rig:
+    """Return the rig with the height that is given, or else by the floor. Raise OmnidError where the ruler contradicts.
 
     Without --only, a height that the rig states is kept, and a floor that is not seen is no error.
     """
     if args.height_m is not None:
-        return rig.at_height(args.height_m), ""
+        return rig.at_height(args.height_m)
     is_wanted = args.ruler_m is not None or "height" in args.only
     if not is_wanted and (args.only or rig.height_m() is not None):
-        return rig, ""
+        return rig
     try:
         found = calibrate_height(args.logs[0], rig, log_cameras(args))
     except OmnidError as error:
         if is_wanted:
             raise
         print(error)
-        return rig, ""
+        return rig
     print(found)
     print(f"the rig so far: {height_of(rig)}")
     if args.ruler_m is not None:
-        contradiction = found.contradiction(args.ruler_m)
-        if contradiction:
-            return rig, contradiction
+        if contradiction := found.contradiction(args.ruler_m):
+            raise OmnidError(f"{contradiction}; nothing was written")
         print(f"{args.ruler_m:.3f} m by ruler agrees")
-    return found.rig, ""
+    return found.rig
 
 
-@command(HEIGHT)
+@options.command(options.HEIGHT)
 def import_rig(args: argparse.Namespace) -> int:
     """Make a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras.
 
@@ -304,7 +286,12 @@ def import_rig(args: argparse.Namespace) -> int:
     if args.output.exists() and not args.replace:
         raise OmnidError(f"--output {args.output} exists: --replace writes the rig in its place")
     write_rig(args.output, rig)
-    print(f"{args.output}: {describe(rig)}")
+    T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
+    rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(T_upper_lower))))
+    lower, upper = (model_in_words(mounted.camera) for mounted in (rig.lower, rig.upper))
+    turned = f"upper rotated by {rotation_deg:.2f} deg"
+    print(f"{args.output}: lower {lower}, upper {upper}, baseline {1e3 * rig.baseline_m:.1f} mm, {turned}")
+    print(f"{args.output}: {height_of(rig)}")
     return 0
 
 
@@ -314,27 +301,13 @@ def _imported(args: argparse.Namespace) -> Rig:
     if given == {"equirectangular", "baseline"}:
         return stacked_rig(args.equirectangular, args.baseline)
     if "camchain" in given <= {"camchain", "lower", "upper"}:
-        return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, warn)
+        return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, options.warn)
     if given - {"view"} in ({"lower", "upper", "transform"}, {"lower", "upper", "baseline"}):
         T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
-        return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", warn)
+        return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", options.warn)
     raise OmnidError(
         "calibrate import: expected a Kalibr camchain.yaml; or two files of OCamCalib as --lower and --upper, with "
         "--transform FILE or --baseline METRES; or --equirectangular WIDTHxHEIGHT with --baseline METRES"
-    )
-
-
-def describe(rig: Rig) -> str:
-    """Return one line about a rig: cameras, baseline, rotation between the cameras, height."""
-    T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(T_upper_lower))))
-    lower, upper = (
-        f"{model_in_words(mounted.camera)} {'x'.join(map(str, mounted.camera.size))}"
-        for mounted in (rig.lower, rig.upper)
-    )
-    return (
-        f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
-        f"{rotation_deg:.2f} deg, {height_of(rig)}"
     )
 
 

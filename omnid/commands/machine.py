@@ -9,7 +9,6 @@ import math
 import sys
 from collections import Counter
 from contextlib import closing
-from importlib.util import find_spec
 from itertools import chain, islice
 from pathlib import Path
 
@@ -23,19 +22,19 @@ from drivers.frame import Camera, gray
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.calibration import snapshot
 from omnid.calibration.images import Image
-from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, failed, settings_of
+from omnid.commands import options
 from omnid.config import FIRST_SETTINGS
 from omnid.doctor import checks
 from omnid.doctor.wheel_wiring import tested_drive
 from omnid.errors import OmnidError
 from omnid.light.exposure import USUAL_HZ
-from omnid.monitor.listen import listen as listen_to
+from omnid.monitor.robot_state import listen as listen_to
 from omnid.service import install
 from omnid.settings import dump
 from omnid.transport.session import zenoh_config
 
 
-@command(SETTINGS)
+@options.command(options.SETTINGS)
 def print_config(args: argparse.Namespace) -> int:
     """Print all settings with their defaults as TOML; or check a file.
 
@@ -51,7 +50,7 @@ def print_config(args: argparse.Namespace) -> int:
     if args.action == "check" and args.file is None:
         raise OmnidError("omnid config check: name the file")
     args.config = args.file or args.config
-    config = settings_of(args)
+    config = options.settings_of(args)
     if args.action == "print":
         print(dump(config, FIRST_SETTINGS if args.minimal else None), end="")
         return 0
@@ -62,7 +61,7 @@ def print_config(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(ROBOT, SECONDS, SETTINGS)
+@options.command(options.ROBOT, options.SECONDS, options.SETTINGS)
 def listen(args: argparse.Namespace) -> int:
     """Show pose, state, rates and latencies of a robot; exit code 1: no pose was received.
 
@@ -70,13 +69,13 @@ def listen(args: argparse.Namespace) -> int:
       listen
       listen --robot rover --connect tcp/robot:7447 --seconds 60
     """
-    return listen_to(settings_of(args).bus, args.seconds)
+    return listen_to(options.settings_of(args).bus, args.seconds)
 
 
-PACKAGES = ("starlette", "uvicorn")
+PAGE = ("starlette", "uvicorn")
 
 
-@command(ROBOT, SETTINGS)
+@options.command(options.ROBOT, options.SETTINGS)
 def web(args: argparse.Namespace) -> int:
     """Serve a page about a robot: state, path, map, warnings with their remedy, a stop and an arm button.
 
@@ -88,53 +87,31 @@ def web(args: argparse.Namespace) -> int:
         none
     --host NAME...          a further name of this machine, in addresses of browsers; without --listen on the network:
         localhost only
-    --tls-certificate FILE  serve over TLS; PEM
-    --tls-key FILE          the private key of the certificate, PEM
 
     examples:
       web
       web --connect tcp/robot:7447
       web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml
     """
-    require_packages()
+    options.require("web", *PAGE)
     from omnid.web.server import serve
 
-    if (args.tls_certificate is None) != (args.tls_key is None):
-        raise OmnidError("--tls-certificate and --tls-key belong together: name both")
-    config = settings_of(args)
-    tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
-    serve(
-        config.bus,
-        listen=args.listen,
-        token_file=args.token_file,
-        stop_token_file=args.stop_token_file,
-        names=tuple(args.host),
-        tls=tls,
-    )
+    serve(options.settings_of(args).bus, args.listen, args.token_file, args.stop_token_file, tuple(args.host))
     return 0
-
-
-def require_packages() -> None:
-    """Raise OmnidError where a package of the page is missing."""
-    missing = [name for name in PACKAGES if find_spec(name) is None]
-    if missing:
-        raise OmnidError(
-            f"omnid web needs {', '.join(missing)}, not installed: {sys.executable} -m pip install {' '.join(missing)}"
-        )
 
 
 ROOT = Path("/")  # folder of sys, dev and proc
 BYTES_PER_PIXEL = 0.2  # of a JPEG of quality 90 from below a mirror
 
 
-@command(SETTINGS)
+@options.command(options.SETTINGS)
 def doctor(args: argparse.Namespace) -> int:
     """Check cameras, motor, rig, rights, bus and disk, a line each; exit code 1: something is wrong.
 
     examples:
       doctor --config /etc/omnid/omnid.toml
     """
-    config, found = settings_of(args), list[checks.Finding]()
+    config, found = options.settings_of(args), list[checks.Finding]()
     camera, wanted = config.cameras, config.realtime
     named: dict[str, V4l2Settings] = {name: camera.settings(name) for name in SIDES}
     images_hz = min(camera.rate_hz or USUAL_HZ, config.record.images_hz or math.inf)
@@ -161,7 +138,7 @@ To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are pl
 """
 
 
-@command(SETTINGS)
+@options.command(options.SETTINGS)
 def show_cameras(args: argparse.Namespace) -> int:
     """List cameras and the udev rule to copy.
 
@@ -178,7 +155,7 @@ def show_cameras(args: argparse.Namespace) -> int:
         return _snapshot(args)
     devices = capture_devices(ROOT)
     if not devices:
-        return failed("no cameras: the kernel has no capture device; check the cables and the output of `dmesg`")
+        return options.failed("no cameras: the kernel has no capture device; check the cables, and `dmesg`")
     for device in devices:
         print(f"{device.node}  {device.name}")
         for line in filter(None, (device.by_path, device.problem)):
@@ -190,7 +167,7 @@ def show_cameras(args: argparse.Namespace) -> int:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    config = settings_of(args)
+    config = options.settings_of(args)
     args.snapshot.mkdir(parents=True, exist_ok=True)
     for camera in SIDES:
         found = _images(config.cameras.settings(camera), camera)
@@ -214,7 +191,7 @@ def _images(settings: V4l2Settings, camera: Camera) -> list[Image]:
         return [gray(frame) for frame in islice(source.frames(), snapshot.IMAGES, 2 * snapshot.IMAGES)]
 
 
-@command(SETTINGS)
+@options.command(options.SETTINGS)
 def test_motor(args: argparse.Namespace) -> int:
     """Turn each wheel, ask what moved, print the settings for that.
 
@@ -228,7 +205,7 @@ def test_motor(args: argparse.Namespace) -> int:
       motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml
       motor test --motor simulated --set motor.protocol=roboteq
     """
-    config = settings_of(args).motor
+    config = options.settings_of(args).motor
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
     motor_protocol(config.protocol)  # known before anybody is asked to raise the robot
@@ -239,17 +216,15 @@ def test_motor(args: argparse.Namespace) -> int:
     return 0
 
 
-def ask(question: str, at_end: str | None = None) -> str:
-    """Print a question and return the answer; at the end of the input at_end. Raise OmnidError where that is None."""
-    sys.stdout.write(question)
-    sys.stdout.flush()
-    line = sys.stdin.readline() or at_end
-    if line is None:
-        raise OmnidError("no answer: the wheels stand")
-    return line.strip()
+def ask(question: str) -> str:
+    """Print a question and return the answer. Raise OmnidError at the end of the input."""
+    try:
+        return input(question).strip()
+    except EOFError:
+        raise OmnidError("no answer: nothing more is done, and the wheels are stopped") from None
 
 
-@command()
+@options.command()
 def install_service(args: argparse.Namespace) -> int:
     """Install the systemd unit for this program, example udev rules and a minimal configuration.
 
@@ -264,7 +239,7 @@ def install_service(args: argparse.Namespace) -> int:
       install-service --page
     """
     if args.page:
-        require_packages()
+        options.require("web", *PAGE)
     program = Path(sys.prefix) / "bin" / "omnid"
     texts = install.files_to_write(program, page=args.page)
     for path in texts:
@@ -274,7 +249,7 @@ def install_service(args: argparse.Namespace) -> int:
     if not texts:
         print("nothing to do")
         return 0
-    if not args.yes and ask("Do this? [y/N] ", "").lower() not in ("y", "yes"):
+    if not args.yes and ask("Do this? [y/N] ").lower() not in ("y", "yes"):
         print("nothing was changed")
         return 1
     install.write(texts)

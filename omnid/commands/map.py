@@ -1,7 +1,4 @@
-"""`omnid map`: build maps of places from logs, show them, export them, and let a robot save its own.
-
-Also the routes on this computer: `omnid route list`.
-"""
+"""Maps of places: `omnid map build`, `show`, `export`."""
 
 from __future__ import annotations
 
@@ -13,8 +10,6 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from omnid.commands import options
-from omnid.commands.robot import ask
-from omnid.config import unused_settings
 from omnid.core.places import place_views
 from omnid.core.places.place_map import PlaceMap, PlaceRig
 from omnid.diagnostics.run_summary import Progress
@@ -22,8 +17,6 @@ from omnid.errors import OmnidError
 from omnid.formats.exports import write_grid, write_ply
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.plan import drawn_heights
-from omnid.formats.route_file import RouteFolder
-from omnid.plain_text import utc
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.files import check_outputs, write_plan
 from omnid.stages.obstacles import ADVICE
@@ -47,14 +40,12 @@ def build(args: argparse.Namespace) -> int:
       map build wednesday.mcap -o place.omap --extend
     """
     # 1. Check the options.
-    config = options.settings_of(args)
+    config = options.settings_of(args, run="replay")
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
     check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
     if args.output.exists() and not (args.extend or args.replace):
         raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
-    for warning in unused_settings(config, "replay", args.set):
-        options.warn(warning)
     # 2. Replay the logs into a copy of the map.
     with TemporaryDirectory() as folder:
         new = Path(folder, args.output.name)
@@ -105,17 +96,13 @@ def export(args: argparse.Namespace) -> int:
     named = [(f"--{kind}", path) for kind in ("ply", "plan", "grid") if (path := vars(args)[kind]) is not None]
     if not named:
         raise OmnidError("map export: nothing to write: give --ply FILE.ply, --plan FILE.png or --grid FILE.yaml")
-    check_outputs(named, inputs := [("the map that is read", args.map)])
-    if args.grid is not None:  # after the check: a folder, as ".", can have no other end
-        named.append(("the grid's image", args.grid.with_suffix(".pgm")))
-        check_outputs(named, inputs)
+    if args.grid is not None:
+        named.append(("the grid's image", args.grid.parent / f"{args.grid.stem}.pgm"))
+    check_outputs(named, [("the map that is read", args.map)])
     places, rig = read_places(args.map)
     if args.grid is not None:
         if not any(keyframe.free_m.any() for keyframe in places.keyframes.values()):
-            options.warn(
-                f"{args.grid}: no cell is free: the map was built without the height of the cameras above the floor: "
-                f"{ADVICE}, and build the map again"
-            )
+            options.warn(f"{args.grid}: no cell is free, as the floor was not known: {ADVICE}, and build the map again")
         write_grid(args.grid, place_views.grid(places, rig, args.cell))
     if args.ply is not None:
         write_ply(args.ply, place_views.landmarks(places, rig, args.cell))
@@ -129,43 +116,17 @@ def export(args: argparse.Namespace) -> int:
     return 0
 
 
-@options.command(options.ROBOT, options.SETTINGS)
-def save(args: argparse.Namespace) -> int:
-    """Ask a robot to save its map now, before it is switched off, and print what became of it.
-
-    examples:
-      map save
-      map save --robot rover --connect tcp/robot:7447
-    """
-    return ask(args, lambda driver: driver.save_map())
-
-
 def _described(path: Path, places: PlaceMap, rig: PlaceRig) -> dict[str, str]:
     """Return the properties of a map, as they are printed."""
-    size, parts = path.stat().st_size, len(places.parts())
+    size = path.stat().st_size
     path_m = sum(math.hypot(*link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)
     return {
         "map": str(path),
         "size": f"{size / 1e6:.1f} MB, {size / max(1, len(places)) / 1e3:.0f} kB a keyframe",
-        "newest": utc(max((keyframe.stamp_ns for keyframe in places.keyframes.values()), default=0)),
         "sessions": str(len({keyframe.session for keyframe in places.keyframes.values()})),
         "keyframes": f"{len(places)}; {places.dropped} were dropped",
         "loops": str(places.loops),
         "path": f"{path_m:.1f} m",
-        "parts": f"{parts}, between which no pose is known" if parts > 1 else "",
         "rig": f"{rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of {rig.cylinder.width} x "
         f"{rig.cylinder.height} px",
     }
-
-
-@options.command(options.SETTINGS)
-def list_routes(args: argparse.Namespace) -> int:
-    """List the routes in navigation.routes, here; exit code 2: a file is damaged.
-
-    examples:
-      route list
-    """
-    folder = RouteFolder(Path(options.settings_of(args).navigation.routes))
-    for route in map(folder.read, folder.names()):
-        print(f"{route.name:<20} {route.length_m:8.1f} m  {utc(route.created_s * 10**9)}  {route.map_name}")
-    return 0

@@ -24,17 +24,23 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import math
 import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import requires
+from importlib.util import find_spec
 from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import msgspec
+
+from omnid.engine.logging_setup import log
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.cameras.v4l2_camera import V4l2Camera
@@ -49,6 +55,7 @@ _DECLARED: Final = re.compile(
 _VALUE: Final = re.compile(r"(?P<optional>\[)?(?P<word>[^\]=]+?)\]?(?P<more>\.\.\.)?(?:=(?P<default>\S+))?")
 
 Run: TypeAlias = Callable[[argparse.Namespace], int]
+warn: Final = partial(log, logging.WARNING)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +84,7 @@ class Command:
         parser.formatter_class = _ExamplesFormatter
         parser.description = " ".join(filter(None, prose))
         parser.epilog = "\n".join(("examples:", *(f"  omnid {example}" for example in self.examples)))
-        parser.set_defaults(command=self, actions=parser._actions)
+        parser.set_defaults(command=self, parser=parser)
 
 
 class _ExamplesFormatter(argparse.HelpFormatter):
@@ -153,22 +160,35 @@ TYPES: Final[Mapping[str, Callable[[str], Any]]] = {
 _PATHS: Final = {"FILE", "FOLDER", "DIR", "LOG", "EST", "TRUTH", "OUT"}
 
 
-def settings_of(args: argparse.Namespace, more: Mapping[str, object] | None = None) -> Config:
+def settings_of(args: argparse.Namespace, more: Mapping[str, object] | None = None, *, run: str = "") -> Config:
     """Return the configuration of --config, --profile, --set, and of the options that stand for a setting.
 
-    more: further settings by their names, None: not given; they win over the options.
+    more: further settings by their names, None: not given; they win over the options. run: `run` or `replay`, to warn
+    of the settings that it does not use.
     """
-    from omnid.config import load_config
+    from omnid.config import load_config, unused_settings
 
-    named = {action.setting: getattr(args, action.dest) for action in args.actions if getattr(action, "setting", "")}
+    actions = [action for action in args.parser._actions if getattr(action, "setting", "")]
+    named = {action.setting: getattr(args, action.dest) for action in actions} | dict(more or {})
     # As --set takes them.
     given = [
         f"{path}={json.dumps(value) if isinstance(value, bool | list) else value}"
-        for path, value in (named | dict(more or {})).items()
+        for path, value in named.items()
         if not (value is None or value is False or value == [])
     ]
     profile = PROFILES[args.profile] if getattr(args, "profile", None) else ()
-    return load_config(args.config, [*profile, *args.set, *given])
+    config = load_config(args.config, [*profile, *args.set, *given])
+    for warning in unused_settings(config, run, args.set) if run else ():
+        warn(warning)
+    return config
+
+
+def require(extra: str, *modules: str) -> None:
+    """Raise OmnidError where a package of an extra is not installed."""
+    if missing := [name for name in modules if find_spec(name) is None]:
+        mark = f"; extra == '{extra}'"
+        packages = " ".join(f"'{line.removesuffix(mark)}'" for line in requires("omnid") or () if line.endswith(mark))
+        raise OmnidError(f"{', '.join(missing)} is not installed: {sys.executable} -m pip install {packages}")
 
 
 # Settings of any command.
@@ -193,7 +213,7 @@ ROBOT: Final = """
 SECONDS: Final = "--seconds S 0.001..1e9  end after S seconds; default: on Ctrl-C"
 
 # A log, its cameras and its rig.
-RIG: Final = "--rig FILE  the rig.toml of the cameras; default: that attached to the log"
+RIG: Final = "--rig FILE  the rig.toml of the cameras; default: that attached to the log\n"
 RATE: Final = """
 --rate HZ [log.rate_hz]  images per second of folders of images; default: by their names in nanoseconds, or the seconds
                          in times.txt
@@ -202,6 +222,7 @@ CAMERAS: Final = """
 --lower TOPIC  images of the lower camera; default: found by name
 --upper TOPIC  images of the upper camera; default: found by name
 """
+LOG: Final = f"{RIG}{CAMERAS}{RATE}"
 LOG_CAMERAS: Final = f"""{CAMERAS}
 --bits 8|10|12|16=16         bits of the cameras in images of 16 bits a sample
 --time auto|header|log=auto  when an image was taken: as log.time of the settings
@@ -224,20 +245,14 @@ HEIGHT: Final = """
 def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:
     """Return what opens a camera of the settings; its events are logged. Raise OmnidError unless there are two."""
     from drivers.cameras.v4l2_camera import V4l2Camera
-    from omnid.engine.logging_setup import log
 
     config.cameras.require_two_devices()
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 
-def warn(line: str) -> None:
-    """Print a warning on stderr."""
-    print(f"omnid: warning: {line}", file=sys.stderr)
-
-
 def failed(line: str) -> int:
-    """Print on stderr why the command has no result; return its exit code, 1."""
-    print(f"omnid: {line}", file=sys.stderr)
+    """Log why the command has no result; return its exit code, 1."""
+    log(logging.ERROR, line)
     return 1
 
 

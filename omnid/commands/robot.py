@@ -1,4 +1,4 @@
-"""Commands to a robot over the bus: `omnid arm`, `stop`, `drive`, `goto`, `route`."""
+"""A robot, over the bus: `omnid arm`, `stop`, `drive`, `goto`, `route`, `map save`; `route list` is of this machine."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import select
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from omnid.client import Answer, Driver, NavigationReport, Robot
@@ -16,12 +17,13 @@ from omnid.core.navigation.requests import route_name
 from omnid.engine.logging_setup import HANDLER
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
+from omnid.formats.route_file import RouteFolder
 from omnid.monitor import navigation
 from omnid.monitor.teleop import teleoperate
 from omnid.navigation_state import NavigationState
+from omnid.plain_text import utc
 
 NAME: Final = "name NAME  letters, digits, '-' and '_'"
-NO_WAIT: Final = "--no-wait  end as soon as the robot has accepted it"
 
 
 @command(ROBOT, SETTINGS)
@@ -68,7 +70,7 @@ def drive(args: argparse.Namespace) -> int:
     return teleoperate(settings_of(args).bus)
 
 
-@command(NO_WAIT, ROBOT, SETTINGS)
+@command(ROBOT, SETTINGS)
 def goto(args: argparse.Namespace) -> int:
     """Drive an armed robot to a pose of its base and wait for the end.
 
@@ -89,10 +91,8 @@ def goto(args: argparse.Namespace) -> int:
       goto --cancel
     """
     verb = next((verb for verb in ("cancel", "pause", "resume") if getattr(args, verb)), None)
-    if verb and args.pose:
-        raise OmnidError(f"goto: --{verb} takes no pose: leave one of them out")
-    if verb is None and len(args.pose) not in (2, 3):
-        raise OmnidError(f"goto: expected X Y [YAW], numbers found: {len(args.pose)}")
+    if len(args.pose) not in ((0,) if verb else (2, 3)):
+        raise OmnidError("goto: expected X Y [YAW], or one of --cancel, --pause and --resume alone")
     if verb is None:
         heading_rad = math.radians(args.pose[2]) if len(args.pose) == 3 else None
         return _drive(args, lambda driver: driver.goal(args.pose[0], args.pose[1], heading_rad, args.frame))
@@ -137,7 +137,7 @@ def teach(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(NAME, NO_WAIT, ROBOT, SETTINGS)
+@command(NAME, ROBOT, SETTINGS)
 def repeat(args: argparse.Namespace) -> int:
     """Repeat a route, from where the robot is on it; exit code 1: its end was not reached, 2: it refuses.
 
@@ -148,7 +148,7 @@ def repeat(args: argparse.Namespace) -> int:
 
     examples:
       route repeat morning
-      route repeat morning --reverse --loops 5 --no-wait
+      route repeat morning --reverse --loops 5
     """
     words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
     text = " ".join([*words, f"loops={args.loops}", f"from={vars(args)['from']}"])
@@ -163,6 +163,30 @@ def end_route(args: argparse.Namespace) -> int:
       route stop
     """
     return ask(args, lambda driver: driver.route("stop"))
+
+
+@command(ROBOT, SETTINGS)
+def save_map(args: argparse.Namespace) -> int:
+    """Ask a robot to save its map now, before it is switched off, and print what became of it.
+
+    examples:
+      map save
+      map save --robot rover --connect tcp/robot:7447
+    """
+    return ask(args, lambda driver: driver.save_map())
+
+
+@command(SETTINGS)
+def list_routes(args: argparse.Namespace) -> int:
+    """List the routes in navigation.routes, here; exit code 2: a file is damaged.
+
+    examples:
+      route list
+    """
+    folder = RouteFolder(Path(settings_of(args).navigation.routes))
+    for route in map(folder.read, folder.names()):
+        print(f"{route.name:<20} {route.length_m:8.1f} m  {utc(route.created_s * 10**9)}  {route.map_name}")
+    return 0
 
 
 def ask(args: argparse.Namespace, *requests: Callable[[Driver], Answer]) -> int:
@@ -182,26 +206,23 @@ def granted(robot: Robot, answer: Answer) -> str:
 
 
 def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int:
-    """Ask for a drive and show it until its end, or with --no-wait until the robot has accepted it.
+    """Ask for a drive and print its states until its end.
 
-    On a terminal it is one line that is rewritten, else a line for each new state. Ctrl-C, a terminal that closes and
-    other ends of this program cancel it, also while the robot has not answered yet.
+    A terminal also shows what is left. Ctrl-C, a terminal that closes and other ends of this program cancel the drive,
+    also while the robot has not answered yet.
     """
-    report, shown, is_terminal = NavigationReport(), "", sys.stdout.isatty()
+    report, shown = NavigationReport(), ""
     with Robot(settings=settings_of(args).bus) as robot:
         driver = robot.driver()
         try:
             with handle_stop_signals(signal.default_int_handler):
                 granted(robot, request(driver))
-                if args.no_wait:
-                    return 0
                 for report in navigation.reports_of(robot, driver.asked_ns):
-                    if is_terminal:
-                        left = f", {report.left_m:.2f} m left" if math.isfinite(report.left_m) else ""
-                        HANDLER.show(f"{report.words}{left}")
-                    elif report.words != shown and report.command_ns == driver.asked_ns:
+                    if report.words != shown and report.command_ns == driver.asked_ns:
+                        HANDLER.show("")
                         print(report.words, flush=True)
                     shown = report.words
+                    HANDLER.show(f"{report.left_m:.2f} m left" if math.isfinite(report.left_m) else "")
         except KeyboardInterrupt:
             words = granted(robot, driver.navigate("cancel"))  # before a word is printed: the terminal may be gone
             HANDLER.show("")
@@ -211,6 +232,4 @@ def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int
     if report.command_ns != driver.asked_ns:
         print(f"not reached: {robot.name} follows another request now: {report.task}")
         return 1
-    if is_terminal:
-        print(report.words)
     return int(report.state != NavigationState.REACHED)

@@ -79,10 +79,13 @@ def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["replay", "x", "--metod", "paper"], "unrecognized arguments: --metod paper: see omnid --help"),
+        (
+            ["replay", "x", "--metod", "paper"],
+            "unrecognized arguments: --metod paper, did you mean --method?; see omnid replay --help",
+        ),
         (
             ["calibrate", "rig", "a", "-o", "b", "--expected-baseline-mm", "-4"],
-            "argument --expected-baseline-mm: expected 0.001 or more, found '-4': see omnid calibrate rig --help",
+            "argument --expected-baseline-mm: expected 0.001 or more, found '-4'; see omnid calibrate rig --help",
         ),
     ],
 )

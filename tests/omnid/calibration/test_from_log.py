@@ -69,7 +69,7 @@ def test_the_command_writes_the_rig_unless_the_ruler_contradicts(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], found: HeightCalibration
 ) -> None:
     words = ("drive", scene / "log.mcap", "--only", "height", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
-    assert command(*words, "--ruler-m", found.floor.height_m + 0.3) == 1
+    assert command(*words, "--ruler-m", found.floor.height_m + 0.3) == 2
     assert "nothing was written" in capsys.readouterr().err and not (tmp_path / "rig.toml").exists()
     assert command(*words, "--ruler-m", f"{found.floor.height_m:.2f}") == 0
     out = capsys.readouterr().out

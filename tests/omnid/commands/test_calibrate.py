@@ -175,7 +175,7 @@ def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
     names = ("00", "00", "00", "01", "01")  # moving, kept, seen before, moving, kept
     pairs = [tuple(image(larger, f"{side}_{name}") for side in ("lower", "upper")) for name in names]
     pairs += [(np.zeros_like(pairs[0][0]),) * 2, (pairs[0][0], np.zeros_like(pairs[0][0]))]  # no board, one camera
-    monkeypatch.setattr("omnid.commands.calibrate.device_opener", lambda _: lambda _: io.BytesIO())
+    monkeypatch.setattr("omnid.commands.options.device_opener", lambda _: lambda _: io.BytesIO())
     monkeypatch.setattr("omnid.commands.calibrate.newest_pairs", lambda *_: pairs)
     words = ("calibrate", "live", kept, *OPTIONS, "--set", f'bus.listen=["{free_endpoint()}"]')
     first = omnid(*words)

@@ -1,10 +1,10 @@
-"""The daemon and what is like it: `omnid run`, `simulate`, `demo`, `record`."""
+"""Runs of the stages, live, simulated or over a log: `omnid run`, `simulate`, `replay`, `demo`; and `omnid record`."""
 
 from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Mapping
+import math
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -17,12 +17,11 @@ from calib import se3
 from calib.rig_file import read_rig, rig_toml
 from calib.se2_arrays import transform
 from drivers.cameras.log_camera import LogCamera, LogImages, LogMotion, LogPlayback
-from drivers.frame import Camera
 from drivers.logs.log_reader import LogCameras, LogReader
-from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, settings_of
-from omnid.commands.replay import replay_and_print
-from omnid.config import Config, unused_settings
+from omnid.commands import options
+from omnid.config import Config
 from omnid.controller.motor import SIMULATED
+from omnid.diagnostics.run_summary import Progress, run_summary, summary_entries
 from omnid.engine.graph import nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
@@ -30,7 +29,7 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.live import ConnectedRobot, record_frames, run_live
-from omnid.runs.replay import ReplayOptions
+from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.session import attached_rig, motion_topics
 from omnid.simulation.demonstration import demonstrate
 from omnid.simulation.paced_robot import PacedRobot
@@ -39,7 +38,7 @@ from omnid.simulation.world_file import load_world
 from omnid.sinks.files import check_outputs, write_trajectory
 
 
-@command(MAP, SETTINGS)
+@options.command(options.MAP, options.SETTINGS)
 def run(args: argparse.Namespace) -> int:
     """Run the daemon until a signal comes: live cameras in, poses on the bus, commands to the wheels.
 
@@ -60,21 +59,13 @@ def run(args: argparse.Namespace) -> int:
       run --lower /dev/video0 --upper /dev/video2 --rig rig.toml
     """
     devices = {"cameras.lower": args.lower, "cameras.upper": args.upper}
-    config = _settings(args, devices if args.log is None else {})
+    config = options.settings_of(args, devices if args.log is None else {}, run="run")
     if args.log is None:
         if args.once or args.pace != 1.0:
             raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
-        run_live(config, ConnectedRobot(device_opener(config)), log)
+        run_live(config, ConnectedRobot(options.device_opener(config)), log)
         return 0
     return _run_log(args, replace(config, controller=config.controller.of_log))
-
-
-def _settings(args: argparse.Namespace, more: Mapping[str, object] | None = None) -> Config:
-    """Return the settings of a live run; warn of those that it does not use."""
-    config = settings_of(args, more)
-    for warning in unused_settings(config, "run", args.set):
-        log(logging.WARNING, warning)
-    return config
 
 
 def _run_log(args: argparse.Namespace, config: Config) -> int:
@@ -83,25 +74,15 @@ def _run_log(args: argparse.Namespace, config: Config) -> int:
     images = LogImages.load(args.log, cameras, motion_topics(config))
     for warning in images.warnings:
         log(logging.WARNING, warning)
-    playbacks: list[LogPlayback] = []  # one for each time that both cameras are opened, the lower one first
-
-    def open_camera(camera: Camera) -> LogCamera:
-        if camera == "lower":
-            playbacks.append(LogPlayback(images, pace=args.pace, once=args.once))
-        return LogCamera(playbacks[-1], camera)
-
-    def open_motion() -> LogMotion:
-        return LogMotion(playbacks[-1])
-
-    rig = None
+    playback, rig = LogPlayback(images, pace=args.pace, once=args.once), None
     if not args.rig:
         with closing(LogReader(args.log, cameras)) as reader:
             rig = attached_rig(reader, args.log)
-    run_live(config, ConnectedRobot(open_camera, open_motion), log, rig)
+    run_live(config, ConnectedRobot(partial(LogCamera, playback), partial(LogMotion, playback)), log, rig)
     return 0
 
 
-@command(MAP, SETTINGS)
+@options.command(options.MAP, options.SETTINGS)
 def simulate(args: argparse.Namespace) -> int:
     """Run the daemon with a simulated robot until a signal comes.
 
@@ -122,7 +103,7 @@ def simulate(args: argparse.Namespace) -> int:
       simulate corridor --light 0.5 --map corridor.omap --set bus.robot=rover
     """
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
-    config = _settings(args)
+    config = options.settings_of(args, run="run")
     # 1. Run in the world.
     world = load_world(args.world, args.seed)
     people = () if args.no_people else world.people
@@ -140,7 +121,86 @@ def simulate(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(VERBOSE, QUIET, SETTINGS)
+@options.command(options.VERBOSE, options.QUIET, options.LOG, options.MAP, options.SETTINGS, options.JSON)
+def replay(args: argparse.Namespace) -> int:
+    """Run a recorded log through the stages of the daemon, and print a summary.
+
+    Exit code 1: no pose was found, or a tenth of the pairs is missing.
+
+    log LOG              an .mcap, .db3 or .bag file, a folder with one or with its parts, or a folder with a folder of
+        stamped images for each camera
+    --start-s S=0 0..    leave out the first S seconds
+    --seconds S 0.001..  read so many seconds only; default: to the end
+
+    outputs:
+    --tum FILE            trajectory, T_odom_rig, one row for every pair
+    --map-tum FILE        trajectory in the map, T_map_rig: places that are recognised correct all poses before them
+    --cloud FILE.ply      the map's points with confidence and age
+    --plan FILE.png       the map from above with the path
+    --record FILE.mcap    poses, transforms, commands, states and map
+    --rerun FILE.rrd      path, images with features, depth and plots for the viewer Rerun; not beside --record
+    --publish             publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon
+        publishes there
+    --motor PORT [motor.port]  send commands to the motor controller on a serial port (the wheels will turn!), or to a
+        'simulated' one
+
+    computation:
+    --method default|paper [odometry.method]   paper: the odometry of the paper on its enhanced SAD, for comparison
+    --tracker improved|klt [odometry.tracker]  feature tracker of the paper's method
+    --inline    one thread, one pair after the other; same results
+    --realtime  at the speed of the recording; late messages are dropped
+
+    examples:
+      replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png
+      replay drive.mcap --record out.mcap --method paper
+      replay drive.mcap --rerun out.rrd
+      replay drive.mcap --start-s 60 --seconds 20
+    """
+    config = options.settings_of(args, run="replay")
+    given = ("rig", "tum", "map_tum", "cloud", "plan", "record", "publish", "inline")
+    asked = ReplayOptions(
+        **{name: vars(args)[name] for name in given},
+        topics=(args.lower, args.upper),
+        span_s=(args.start_s, math.inf if args.seconds is None else args.start_s + args.seconds),
+        paced=args.realtime,
+        drops=args.realtime,
+        settings=args.config,
+    )
+    if args.rerun is None:
+        return replay_and_print(args.log, config, asked, args)
+    if args.record is not None:
+        raise OmnidError("--rerun and --record exclude each other: replay the log once for each")
+    from omnid.commands.recordings import sink_of
+
+    with closing(sink_of(args.rerun, args.log)) as sink:
+        from omnid.viewer.rerun_sink import ReplayDrawing
+
+        drawn = replace(asked, map_every_s=config.live.cloud_s, observer=partial(ReplayDrawing, sink))
+        return replay_and_print(args.log, config, drawn, args)
+
+
+def replay_and_print(log: Path, config: Config, asked: ReplayOptions, args: argparse.Namespace) -> int:
+    """Replay a log, print warnings on stderr and the summary on stdout, and return the exit code.
+
+    args: --quiet, --verbose, and perhaps --json.
+    """
+    result = run_log(log, config, asked if args.quiet else replace(asked, progress=Progress()))
+    for warning in result.warnings:
+        options.warn(warning)
+    if getattr(args, "json", False):
+        found = {name: getattr(result, name) for name in ("counters", "warnings", "signal", "elapsed_s")}
+        options.print_json(found | {"timings": {stage: row._asdict() for stage, row in result.timings.items()}})
+    else:
+        entries = summary_entries(result.counters, verbose=args.verbose)
+        pairs_hz = result.counters.pairs / max(1e-3, result.elapsed_s)
+        entries["speed"] = f"{pairs_hz:.1f} pairs/s, in {result.elapsed_s:.1f} s"
+        if files := [path for _, path in asked.files] + ([result.map_file] if result.map_file else []):
+            entries["written"] = ", ".join(map(str, files))
+        print(run_summary(entries, result.timings.values() if args.verbose else ()))
+    return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))
+
+
+@options.command(options.VERBOSE, options.QUIET, options.SETTINGS)
 def demo(args: argparse.Namespace) -> int:
     """Replay a sample in real time, with files, bus and a simulated motor, and print its errors; or drive.
 
@@ -158,7 +218,7 @@ def demo(args: argparse.Namespace) -> int:
     if args.drive:
         return _drive(args)
     tum = args.output / "trajectory.tum"
-    options = ReplayOptions(
+    asked = ReplayOptions(
         tum=tum,
         cloud=args.output / "map.ply",
         plan=args.output / "plan.png",
@@ -168,10 +228,10 @@ def demo(args: argparse.Namespace) -> int:
         settings=args.config,
     )
     args.set = ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.set]
-    config = settings_of(args)
+    config = options.settings_of(args)
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
-        code = replay_and_print(log, config, options, args)
+        code = replay_and_print(log, config, asked, args)
         if code == 0:
             print(f"\nagainst the truth:\n{evaluate(read_tum(tum), read_tum(truth))}")
     return code
@@ -180,7 +240,7 @@ def demo(args: argparse.Namespace) -> int:
 def _drive(args: argparse.Namespace) -> int:
     """Drive a simulated robot; print the errors against the truth, and draw both paths."""
     place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
-    config = settings_of(args, {"places.map": place_map, "navigation.routes": routes})
+    config = options.settings_of(args, {"places.map": place_map, "navigation.routes": routes})
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
     prepare_kernels()  # which says so where it takes long
     show = nothing if args.quiet else partial(print, flush=True)
@@ -190,7 +250,7 @@ def _drive(args: argparse.Namespace) -> int:
     return int(not is_reached)
 
 
-@command(SETTINGS)
+@options.command(options.SETTINGS)
 def record(args: argparse.Namespace) -> int:
     """Record both cameras to MCAP files until Ctrl-C; exit code 1: nothing was recorded.
 
@@ -203,13 +263,13 @@ def record(args: argparse.Namespace) -> int:
       record recordings/ --rig rig.toml
       record boards/ --lower /dev/video0 --upper /dev/video2
     """
-    config = settings_of(args)
+    config = options.settings_of(args)
     path, rig = Path(config.cameras.rig), ""
     if args.rig is not None or path.exists():
         rig = rig_toml(read_rig(path))
     else:  # the recording may be for its calibration
         log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
-    open_camera = device_opener(config)
+    open_camera = options.device_opener(config)
     with closing(open_camera("lower")) as lower, closing(open_camera("upper")) as upper:
         state = record_frames({"lower": lower, "upper": upper}, config, rig, log).state
     return 0 if state.messages > state.lost else 1

@@ -1,4 +1,4 @@
-"""A recording in images: `omnid report` writes a page about it, `omnid view` draws it, or a robot, in Rerun."""
+"""What was recorded: `omnid log info`, `eval`, `report`; `omnid view`, which also shows a robot."""
 
 from __future__ import annotations
 
@@ -9,21 +9,28 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import closing
-from importlib.util import find_spec
+from collections import Counter
+from contextlib import closing, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from calib import se3
 from calib.atomic_file import write_file
-from drivers.errors import FrameDecodeError
+from drivers.errors import DriverError, FrameDecodeError
+from drivers.logs.log import Log
+from drivers.logs.open_log import open_log
 from omnid.client import Robot
-from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, failed, settings_of, warn
+from omnid.commands import options
 from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
-from omnid.formats.tum import read_tum
+from omnid.formats.tum import Trajectory, read_tum
 from omnid.monitor.robot_state import RobotState
-from omnid.plain_text import plain
+from omnid.plain_text import plain, utc
+from omnid.recordings.evaluation import evaluate, turned_body
 from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
@@ -33,9 +40,97 @@ from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 if TYPE_CHECKING:  # it imports rerun, which may be missing
     from omnid.viewer.rerun_sink import RerunSink
 
+BROKEN = "cut or corrupt"
 
-@command(ROBOT, SECONDS, SETTINGS)
-def run(args: argparse.Namespace) -> int:
+
+@options.command(options.RATE)
+def info(args: argparse.Namespace) -> int:
+    """Print topics, types, counts, times, attachments, and whether the log is whole.
+
+    Exit code 1: one is broken; 2: one is no log.
+
+    logs LOG...  .mcap, .db3, .bag, or a folder of these or of images
+
+    examples:
+      log info recordings/*.mcap
+      log info images --rate 20
+    """
+    code = 0
+    for number, path in enumerate(args.logs):
+        try:
+            log = open_log(path, args.rate or 0.0)
+        except DriverError as error:
+            options.failed(plain(str(error)))
+            code = 2
+            continue
+        print("\n" * bool(number), end="")
+        with closing(log):
+            _show(log)
+        code = max(code, int(log.state == BROKEN))
+    return code
+
+
+def _show(log: Log) -> None:
+    """Print the properties of a log, and the table of its topics. The log may contain anything."""
+    counts = Counter(message.topic for message in log.messages())  # what cannot be read shows by that
+    skipped = f"{len(log.faults)} corrupt chunks or records, which are skipped" if log.faults else ""
+    state = ": ".join(filter(None, (log.state, log.cut, skipped)))
+    logged_ns, time = log.entries["time_ns"], ""
+    if logged_ns.size:
+        first_ns, last_ns = int(logged_ns.min()), int(logged_ns.max())
+        time = f"{utc(first_ns)} to {utc(last_ns)}, {(last_ns - first_ns) / 1e9:.3f} s"
+    listed = ", ".join(f"{name} ({len(data) / 1e3:.1f} kB)" for name, data in log.attachments().items())
+    entries = {"log": str(log.path), "size": f"{log.size_bytes / 1e6:.1f} MB", "state": state, "time": time}
+    entries |= {"messages": str(counts.total()), "attachments": listed or "none"}
+    options.print_entries({name: plain(text) for name, text in entries.items()})
+    rows = []
+    for number, (name, kind) in enumerate(log.topics.items()):
+        span_s = 1e-9 * np.ptp(logged_ns[log.topic == number]) if counts[name] > 1 else 0.0
+        rate = f"{(counts[name] - 1) / span_s:.2f}" if span_s else "-"
+        rows.append((plain(name), plain(kind) or "-", counts[name], rate))
+    rows.sort()
+    if rows:
+        wide, wide_kind = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:2])
+        print(f"\n{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}")
+    for name, kind, count, rate in rows:
+        print(f"{name:<{wide}}  {kind:<{wide_kind}}{count:>10}{rate:>9}")
+
+
+@options.command(options.JSON)
+def evaluate_run(args: argparse.Namespace) -> int:
+    """Compare a trajectory with the truth, both in the TUM format.
+
+    estimate EST           t x y z qx qy qz qw, T_odom_rig
+    truth TRUTH            the same format, of the same rig frame in any world frame
+    --tolerance-ms MS=10   largest difference between the stamps of two poses
+    --align origin|rigid=origin  the first pose, as evo's --align_origin; rigid: all positions, as its --align
+    --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit three angles by which its axes are turned, and
+        print them
+
+    examples:
+      eval est.txt truth.txt
+      eval est.txt imu_truth.txt --frame auto
+      eval est.txt truth.txt --align rigid --json
+    """
+    estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
+    known: dict[str, object] = {}
+    if args.frame == "auto":
+        T_rig_body = turned_body(estimate, truth, tolerance_s)
+        truth = Trajectory(truth.stamps_ns, truth.T @ se3.inverse(T_rig_body))
+        turn_deg = np.rad2deg(se3.rotation_log(T_rig_body[:3, :3]))
+        known["turned_deg"] = [round(float(angle), 2) for angle in turn_deg]
+    metrics = evaluate(estimate, truth, tolerance_s, args.align)
+    if args.json:
+        options.print_json(asdict(metrics) | known)
+        return 0
+    if known:
+        print(f"the truth is of a body turned by {known['turned_deg']} deg: fitted, so the errors are optimistic")
+    print(metrics)
+    return 0
+
+
+@options.command(options.ROBOT, options.SECONDS, options.SETTINGS)
+def view(args: argparse.Namespace) -> int:
     """Show a recording or a robot: path, map, images, plots (needs rerun). Exit code 1: there was no pose to show.
 
     log [LOG]               a recording, which is shown as it stands (of a log of images: `omnid replay LOG --rerun
@@ -48,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
       view out.mcap -o out.rrd
       view --robot rover --connect tcp/robot:7447
     """
-    config = settings_of(args)
+    config = options.settings_of(args)
     with closing(sink_of(args.output, args.log)) as sink:
         if args.log is None:
             _draw_robot(sink, config, math.inf if args.seconds is None else args.seconds)
@@ -64,10 +159,7 @@ def sink_of(output: Path | None, log: Path | None) -> RerunSink:
 
     Raise OmnidError where Rerun is missing, or the file is the log.
     """
-    if find_spec("rerun") is None:
-        raise OmnidError(
-            f"this draws with rerun, which is not installed: {sys.executable} -m pip install 'rerun-sdk>=0.41'"
-        )
+    options.require("view", "rerun")
     os.environ.setdefault("RUST_LOG", "off")  # omnid reports errors of rerun itself
     import rerun
 
@@ -108,16 +200,12 @@ def _viewer() -> str:
 
 def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | None) -> None:
     """Draw what is recorded. Raise OmnidError where there is no pose in it."""
-    broken_images = 0
     with closing(RecordingReader(log, topic, robot)) as reader:
         for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
-            try:
+            with suppress(FrameDecodeError):
                 sink.draw(message.content)
-            except FrameDecodeError:
-                broken_images += 1
-    damaged = len(reader.log.faults) + bool(reader.log.cut)
-    if unreadable := reader.unreadable.total() + damaged + broken_images:
-        warn(f"{log}: {unreadable} messages or pieces cannot be read")
+    if unreadable := reader.unreadable.total() + len(reader.log.faults) + bool(reader.log.cut):
+        options.warn(f"{log}: {unreadable} messages or pieces cannot be read")
     if not sink.poses:
         raise reader.no_pose()
 
@@ -136,10 +224,10 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
             if content is not None:
                 sink.draw(content)
     if not sink.poses:
-        failed(f"no pose of {config.bus.robot} came: `omnid listen` names those that are there")
+        options.failed(f"no pose of {config.bus.robot} came: `omnid listen` names those that are there")
 
 
-@command()
+@options.command()
 def report(args: argparse.Namespace) -> int:
     """Write one HTML page about a recording: path, events, statistics.
 
@@ -158,6 +246,5 @@ def report(args: argparse.Namespace) -> int:
     recorded = RecordedRun(args.log, args.topic)
     html = report_html(recorded, truth)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
-    line = f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"
-    print(plain(line))
+    print(plain(f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"))
     return 0
