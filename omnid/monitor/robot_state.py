@@ -1,26 +1,31 @@
-"""The state of a robot as its messages show it: one inbox and one decoder for terminals, pages and viewers."""
+"""The state of a robot as its messages show it: one inbox and one decoder for terminals, pages and viewers.
+
+`omnid listen` counts and shows the messages of a robot, until a signal or for a given time.
+"""
 
 from __future__ import annotations
 
 import math
+import shutil
+import sys
 import time
 from collections import deque
-from contextlib import suppress
-from dataclasses import replace
-from queue import Empty, SimpleQueue
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import IO, Any, Final, NamedTuple
 
-from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.telemetry import Histogram
+import numpy as np
+
+from omnid.client import Robot
+from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
-from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key
+from omnid.transport.session import PERIOD_S, BusConfig
+from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key, short_name
 from omnid.transport.topics import PUBLISHED
 
 LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
-OTHER_CLOCK_NS: Final = 3_600 * 10**9  # Stamps that differ by more are of two clocks.
 _INBOX_DEPTH: Final = 2000
 _RECENT: Final = 100  # poses
 
@@ -28,44 +33,39 @@ _RECENT: Final = 100  # poses
 class ReceivedMessage(NamedTuple):
     """A message as it arrived."""
 
-    received_ns: int  # Unix time, which may be set between two messages
     topic: str
     payload: bytes
     attachment: bytes
-    arrival_ns: int  # the same by CLOCK_MONOTONIC
+    arrival_s: float  # by CLOCK_MONOTONIC
 
 
 class RobotState:
-    """Newest pose and status of one robot, counters and latencies, in constant memory.
+    """Newest pose and status of one robot, and counters, in constant memory.
 
-    Messages wait in an inbox, of which the oldest are dropped and counted when it is full.
+    Messages wait in an inbox, of which the oldest are dropped when it is full.
     """
 
     def __init__(self) -> None:
-        self._inbox: SimpleQueue[ReceivedMessage] = SimpleQueue()
-        self.dropped = 0  # messages
+        self._inbox: deque[ReceivedMessage] = deque(maxlen=_INBOX_DEPTH)
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
         self.poses = self.missed = self.broken = 0
-        self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.recent: deque[Pose] = deque(maxlen=_RECENT)  # newest poses of the run: what is seen from one comes later
         self._arrivals_s: deque[float] = deque(maxlen=_RECENT)
 
     def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
         """Add a message that has just arrived, from any thread; does not block."""
-        self._inbox.put(ReceivedMessage(time.time_ns(), topic, payload, attachment, time.monotonic_ns()))
-        if self._inbox.qsize() > _INBOX_DEPTH:
-            with suppress(Empty):
-                self._inbox.get_nowait()
-                self.dropped += 1
+        self._inbox.append(ReceivedMessage(topic, payload, attachment, time.monotonic()))
 
     def next(self, timeout_s: float) -> tuple[ReceivedMessage, Any] | None:
         """Process the oldest message of the inbox; return it and its content, or None after the timeout."""
-        try:
-            message = self._inbox.get(timeout=max(0.0, timeout_s))
-        except Empty:
-            return None
+        end_s = time.monotonic() + timeout_s
+        while not self._inbox:
+            if time.monotonic() >= end_s:
+                return None
+            time.sleep(PERIOD_S)
+        message = self._inbox.popleft()
         return message, self.process(message)
 
     def process(self, message: ReceivedMessage) -> Any:
@@ -78,36 +78,29 @@ class RobotState:
             self.broken += 1
             return None
         if isinstance(content, Pose):
-            content = self._add_pose(replace(content, received_ns=message.received_ns), message.arrival_ns * S_PER_NS)
+            self._add_pose(content, message.arrival_s)
         elif isinstance(content, Diagnostics):
             self.add_diagnostics(content)
         return content
 
     def set_alive(self, alive: bool) -> None:
-        """Keep whether the daemon's liveliness token is there; from any thread."""
-        self.alive = alive
+        """Keep whether the daemon's liveliness token is there; from any thread.
 
-    def forget_ended(self) -> bool:
-        """Forget the statuses of a daemon that has ended: it may start again in another state. True if there were any.
-
-        It is called by the thread that processes the messages.
+        The statuses of a daemon that has ended are forgotten: it may start again in another state.
         """
-        had_any = bool(self.statuses) and self.alive is False
-        if had_any:
-            self.statuses.clear()
-        return had_any
+        self.alive = alive
+        if not alive:
+            self.statuses = {}
 
     def add_diagnostics(self, diagnostics: Diagnostics) -> None:
         """Keep the newest status of each part of the robot."""
-        for status in diagnostics.statuses:
+        for status in diagnostics.statuses if self.alive is not False else ():
             if status.name in self.statuses or len(self.statuses) < MOST_ENTRIES:
                 self.statuses[status.name] = status
-        if self.real_time_factor:
-            self.age = Histogram()
 
-    def _add_pose(self, pose: Pose, arrival_s: float) -> Pose:
+    def _add_pose(self, pose: Pose, arrival_s: float) -> None:
         """Count a pose. Skipped sequence numbers of a run are missed poses."""
-        if self.pose is not None and pose.attachment.run == self.run:
+        if self.pose is not None and pose.attachment.run == self.pose.attachment.run:
             self.missed += max(0, pose.attachment.seq - self.pose.attachment.seq - 1)
         else:
             self.recent.clear()
@@ -115,15 +108,6 @@ class RobotState:
         self.pose = pose
         self.poses += 1
         self._arrivals_s.append(arrival_s)
-        age_ns = pose.received_ns - pose.stamp_ns
-        if not self.real_time_factor and 0 <= age_ns < OTHER_CLOCK_NS:
-            self.age.add(age_ns * S_PER_NS)
-        return pose
-
-    @property
-    def run(self) -> str:
-        """Identity of the daemon's run, which begins a new odom."""
-        return "" if self.pose is None else self.pose.attachment.run
 
     @property
     def real_time_factor(self) -> str:
@@ -157,3 +141,64 @@ class RobotState:
 def importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
     """Return a key by which entries are sorted: the worst first, stages last, then by name."""
     return -(status.level % len(LEVELS)), status.name.startswith(STAGE_PREFIX), status.name
+
+
+def listen(bus: BusConfig, seconds: float | None) -> int:
+    """Show the robot until a signal or for a number of seconds. Return the exit code, 1 where no pose arrived.
+
+    Raise Unreachable where no endpoint answers.
+    """
+    state, signals = RobotState(), list[int]()
+    end_s = math.inf if seconds is None else time.monotonic() + seconds
+    with handle_stop_signals(lambda number, _: signals.append(number)), Robot(settings=bus) as robot:
+        robot.on_message(state.put, "odom")
+        robot.on_message(state.put, "status", kept=True)
+        robot.on_alive(state.set_alive)
+        while not signals and time.monotonic() < end_s:
+            # Process messages for a second, and show the state.
+            next_s = min(end_s, time.monotonic() + 1.0)
+            while (left_s := next_s - time.monotonic()) > 0 and not signals:
+                state.next(left_s)
+            print_state(robot.name, state)
+    return int(state.poses == 0)
+
+
+def print_state(robot: str, state: RobotState, out: IO[str] | None = None) -> None:
+    """Write a table in place on a terminal, as far as it fits, else one line."""
+    out = out or sys.stdout
+    if out.isatty():
+        size = shutil.get_terminal_size()
+        lines = [line[: size.columns] for line in status_table(robot, state)]
+        out.write("\x1b[H\x1b[J" + "\n".join(lines[: size.lines - 1]) + "\n")
+    else:
+        out.write("  ".join(line.strip() for line in pose_lines(robot, state)) + "\n")
+    out.flush()
+
+
+def pose_lines(robot: str, state: RobotState) -> Iterator[str]:
+    """Yield the state, and where there is a pose its position, uncertainty and losses."""
+    if state.pose is None:
+        yield f"{robot}: {state.state}"
+        return
+    pose, details = state.pose, state.pose.attachment
+    sigma = np.sqrt(np.maximum(0.0, pose.covariance.diagonal()))
+    yield f"{robot}: {state.state}  {state.rate_hz:.1f} poses/s"
+    yaw_deg = math.degrees(pose.yaw_rad)
+    yield f"  x {pose.x_m:+.3f} y {pose.y_m:+.3f} z {pose.z_m:+.3f} m  yaw {yaw_deg:+.2f} deg"
+    yield (
+        f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
+        f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
+    )
+    pace = f"{state.real_time_factor} x real time  " if state.real_time_factor else ""
+    yield f"  {pace}missed {state.missed}  unreadable {state.broken}"
+
+
+def status_table(robot: str, state: RobotState) -> Iterator[str]:
+    """Yield the lines of the pose, and a line for each part of the robot.
+
+    Parts with a warning or an error come first, stages last: a small terminal shows what matters.
+    """
+    yield from pose_lines(robot, state)
+    for status in sorted(state.statuses.values(), key=importance):
+        values = "  ".join(f"{key} {value}" for key, value in status.values.items())
+        yield f"  {LEVELS[status.level % len(LEVELS)]:7s} {short_name(status.name):16s} {status.message}  {values}"

@@ -31,7 +31,6 @@ PERIOD_S: Final = 0.05  # Period of the commands.
 # a motion; then nothing, so that others may drive.
 HOLD_S: Final = 0.6
 FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
-SHARE_STEP: Final = 0.1
 HELP: Final = "arrows: drive  space: stop  a: arm  +/-: speed  q: quit"
 _SIDES: Final = {b"A": (0, 1), b"B": (0, -1), b"D": (1, 1), b"C": (1, -1)}  # axis of the stick, and its side
 # A terminal sends ESC [ A or, in its application mode, ESC O A.
@@ -63,8 +62,7 @@ class Stick:
                 axis, side = ARROWS[key]
                 self._axes[axis] = side, now_s
             elif key in (b"+", b"=", b"-"):
-                step = -SHARE_STEP if key == b"-" else SHARE_STEP
-                self.share = min(1.0, max(SHARE_STEP, self.share + step))
+                self.share = self.share / 2 if key == b"-" else min(1.0, 2 * self.share)
             elif key in b"aA":
                 self.arm_asked = True
             elif key in b"qQ\x04":
@@ -150,11 +148,9 @@ def raw_keys() -> Iterator[int]:
 
 def read_keys(keys: int) -> bytes:
     """Return the bytes of the keys pressed within PERIOD_S, after a full PERIOD_S; raise OmnidError at the end."""
-    due_s, data = time.monotonic() + PERIOD_S, b""
-    while (left_s := due_s - time.monotonic()) > 0:
-        if select.select([keys], [], [], left_s)[0]:
-            found = os.read(keys, DEFAULT_BUFFER_SIZE)
-            if not found:
-                raise OmnidError("the terminal was closed: the wheels stop")
-            data += found
-    return data
+    time.sleep(PERIOD_S)
+    if not select.select([keys], [], [], 0)[0]:
+        return b""
+    if not (found := os.read(keys, DEFAULT_BUFFER_SIZE)):
+        raise OmnidError("the terminal was closed: the wheels stop")
+    return found

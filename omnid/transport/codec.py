@@ -28,6 +28,7 @@ from rosbags.typesys.store import Typestore
 from calib import se3
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.errors import OmnidError
+from omnid.plain_text import MOST_ENTRIES, plain
 
 if TYPE_CHECKING:
     from omnid.core.obstacles.moving_tracker import MovingObstacle
@@ -311,10 +312,15 @@ def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> byte
 
 
 def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
-    """Decode a DiagnosticArray."""
+    """Decode a DiagnosticArray; its texts, which may be anything, become printable ones of limited length."""
     message = decoded(payload, DIAGNOSTICS_SCHEMA)
     statuses = tuple(
-        DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
+        DiagnosticStatus(
+            plain(entry.name),
+            int(entry.level),
+            plain(entry.message),
+            {plain(pair.key): plain(pair.value) for pair in entry.values[:MOST_ENTRIES]},
+        )
         for entry in message.status
     )
     return Diagnostics(stamp_of(message.header), statuses)

@@ -8,18 +8,16 @@ has shown, and is answered as soon as there is something: one that is slow skips
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import re
-import secrets
 import time
 import zlib
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from dataclasses import asdict
 from http import HTTPStatus
-from itertools import islice
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
@@ -27,7 +25,8 @@ from starlette.responses import PlainTextResponse, Response
 from calib import se3
 from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
 from omnid.monitor.robot_state import LEVELS, ReceivedMessage, RobotState, importance
-from omnid.plain_text import MOST_ENTRIES, plain
+from omnid.monitor.teleop import PERIOD_S
+from omnid.plain_text import plain
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
 from omnid.transport.session import BusConfig
 from omnid.transport.status_names import CALIBRATION, MAP_FILE, PLACES, WHEELS, Key, short_name
@@ -36,8 +35,7 @@ from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
 NAVIGATION: Final = "navigation"
-PATH_FRAME: Final = "odom"
-FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
+FRAMES: Final = ("odom", "map")  # Frames of a map that is drawn.
 # Topics whose newest message alone counts.
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", "path", PANORAMA)
 
@@ -51,25 +49,23 @@ class RobotFeed:
         self.state = RobotState()
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
-        # Of the news: it grows by one each time, from a number of this start, so that pages which were open while this
-        # program started again have seen none of them.
-        self.version = self._start = secrets.randbits(48)  # of 15 digits at most
+        # Of the news: it grows by one each time, and more slowly than this first one, which is Unix time in ms: pages
+        # that were open while this program started again have seen none of them.
+        self.version = time.time_ns() // 1_000_000
         self._news: dict[str, tuple[int, Any]] = {}  # newest content of each kind, and the version that it came with
         self._images: dict[str, Response] = {}  # cells of the map, and the panorama
-        self._changed = asyncio.Condition()
         self._wanted_until_s = -math.inf  # the panorama
         self._map_in_odom: list[float] | None = None
         self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
-        self._wake = asyncio.Event()
 
     def news(self, seen: int) -> dict[str, Any]:
         """Return all that has changed since a version, and the state."""
-        if not self._start <= seen <= self.version:  # of another start of this program
+        if seen > self.version:  # of a computer's clock that was set back
             seen = 0
         state = state_news(self.bus.robot, self.state, self.link)
         state |= {"panorama_comes": PANORAMA in self._news, "map_in_odom": self._map_in_odom}
         found = {"seen": self.version, "state": state}
-        return dict(browsable(found | {k: content for k, (version, content) in self._news.items() if version > seen}))
+        return found | {kind: content for kind, (version, content) in self._news.items() if version > seen}
 
     async def live(self, request: Request) -> Response:
         """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
@@ -78,11 +74,9 @@ class RobotFeed:
             return _text("the page names the version of the news that it has seen", HTTPStatus.BAD_REQUEST)
         if request.query_params.get("panorama") == "1":
             self._wanted_until_s = time.monotonic() + 4 * QUIET_S
-        if int(seen) == self.version:
-            async with self._changed:
-                await self._changed.wait()
-        text = json.dumps(self.news(int(seen)), separators=(",", ":"), allow_nan=False)
-        return Response(text, media_type="application/json")
+        while int(seen) == self.version:
+            await asyncio.sleep(PERIOD_S)
+        return Response(msgspec.json.encode(self.news(int(seen))), media_type="application/json")  # NaN becomes null
 
     async def image(self, request: Request) -> Response:
         """Return the cells of the map, a byte each as `map_cells` makes them, or the newest panorama."""
@@ -98,32 +92,24 @@ class RobotFeed:
 
     async def _give_news(self) -> None:
         """Process what has come, and let the browsers that wait have it."""
+        given_s = -math.inf
         while True:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(QUIET_S):
-                    await self._wake.wait()
-            self._wake.clear()
-            self.process_inbox()
+            await asyncio.sleep(PERIOD_S)
+            has_news = self.process_inbox() or bool(self._large)
             while self._large:
                 await asyncio.to_thread(self.process_large, self._large.popitem()[1])
-            async with self._changed:
-                self.version += 1
-                self._changed.notify_all()
-            await asyncio.sleep(0.03)  # least time between two answers to a browser
+            if has_news or time.monotonic() > given_s + QUIET_S:
+                self.version, given_s = self.version + 1, time.monotonic()
 
     async def _connect(self) -> None:
         """Open the connection, take what was published before it, then receive the panorama while browsers show it."""
-        loop = asyncio.get_running_loop()
 
         def receive(topic: str, payload: bytes, attachment: bytes) -> None:
             """Take a message, in a thread of zenoh."""
             if topic in _NEWEST_ONLY:  # in place of one that was not processed yet
-                self._large[topic] = ReceivedMessage(0, topic, payload, attachment, 0)
+                self._large[topic] = ReceivedMessage(topic, payload, attachment, 0.0)
             else:
                 self.state.put(topic, payload, attachment)
-            if not self._wake.is_set():
-                with suppress(RuntimeError):  # the event loop has ended
-                    loop.call_soon_threadsafe(self._wake.set)
 
         while self.robot is None:
             try:
@@ -149,10 +135,11 @@ class RobotFeed:
         """Have a content sent with the next news."""
         self._news[kind] = self.version + 1, content
 
-    def process_inbox(self) -> None:
-        """Process the poses and statuses that have come; forget the statuses of a daemon that has ended."""
-        before, has_news = self.state.pose, False
+    def process_inbox(self) -> bool:
+        """Process poses and statuses, return True if any came; forget the statuses of a daemon that has ended."""
+        before, has_any, has_news = self.state.pose, False, False
         while (received := self.state.next(0.0)) is not None:
+            has_any = True
             match received[1]:
                 case Pose() as pose:
                     # Another run has another odom, for which the pages load again.
@@ -165,8 +152,9 @@ class RobotFeed:
                     self._map_in_odom = map_in_odom(in_map, self.state.recent) or self._map_in_odom
                 case Diagnostics():
                     has_news = True
-        if self.state.forget_ended() or has_news:
+        if has_news or not self.state.statuses:
             self._set("parts", parts_news(self.state))
+        return has_any
 
     def process_large(self, message: ReceivedMessage) -> None:
         """Process a scan, a report of the navigation, a map, a path or a panorama in a thread: that takes time."""
@@ -174,10 +162,9 @@ class RobotFeed:
             case Scan() as scan:
                 self._set(SCAN, scan_news(scan, list(self.state.recent)))
             case NavigationReport() as report:
-                names = ("state", "reason", "task", "left_m", "teaching", "taught_m", "refusal")
-                self._set(NAVIGATION, {name: getattr(report, name) for name in names})
-            case PlanarPath(frame=frame, xy=xy) if frame == PATH_FRAME:
-                self._set("path", xy.tolist())
+                self._set(NAVIGATION, asdict(report))
+            case PlanarPath(frame=frame, xy=xy) if frame == "odom":
+                self._set("path", xy.round(3).tolist())
             case Map() as grid:
                 header, cells = map_cells(grid)
                 encoding = {"content-encoding": "deflate"}
@@ -211,27 +198,12 @@ def state_news(robot: str, state: RobotState, link: str) -> dict[str, Any]:
         "fresh": state.rate_hz > 0,
         "run": None if state.pose is None else state.pose.attachment.run,
         "pose": None if state.pose is None else _pose(state.pose),
-        "age_ms": [1e3 * state.age.p(q) for q in (0.5, 0.99)],
         "wheels": _wheels(state),
         "in_map": None if PLACES not in state.statuses else state.statuses[PLACES].message,
         "pace": state.real_time_factor,
         "warnings": _warnings(state, link),
         "server_ms": server_ms(),
     }
-
-
-def browsable(value: Any) -> Any:
-    """Return a value as browsers are sent it: text is plain, a number has 6 digits, None is what JSON lacks."""
-    match value:
-        case dict():
-            return {key: browsable(inner) for key, inner in value.items()}
-        case list():
-            return [browsable(inner) for inner in value]
-        case str():
-            return plain(value)
-        case float():
-            return float(f"{value:.6g}") if math.isfinite(value) else None
-    return value
 
 
 def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float] | None:
@@ -246,10 +218,9 @@ def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float] | None:
 def parts_news(state: RobotState) -> list[dict[str, Any]]:
     """Return the status entries of which the page shows the values."""
     found = [part for name in (CALIBRATION, MAP_FILE) if (part := state.statuses.get(name)) is not None]
-    values = [[list(pair) for pair in islice(part.values.items(), MOST_ENTRIES)] for part in found]
     return [
-        {"name": short_name(part.name), "message": part.message, "values": pairs}
-        for part, pairs in zip(found, values, strict=True)
+        {"name": short_name(it.name), "level": it.level, "message": it.message, "values": list(it.values.items())}
+        for it in found
     ]
 
 
@@ -260,7 +231,7 @@ def map_cells(grid: Map) -> tuple[dict[str, Any], bytes]:
     place in odom is part of the state.
     """
     if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
-        return {"width": 0, "frame": grid.frame}, b""
+        return {"width": 0, "frame": plain(grid.frame)}, b""
     cells = np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8)
     header = {
         "width": cells.shape[1],
@@ -293,7 +264,7 @@ def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
     nearest, angles = int(ranges_m.argmin()), azimuths_rad + place.yaw_rad
     points = np.column_stack([place.x_m + ranges_m * np.cos(angles), place.y_m + ranges_m * np.sin(angles)])
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
-    return {"points": points.tolist(), "nearest": [float(ranges_m[nearest]), turn_deg]}
+    return {"points": points.round(3).tolist(), "nearest": [float(ranges_m[nearest]), turn_deg]}
 
 
 def _pose(pose: Pose) -> dict[str, Any]:
@@ -315,7 +286,6 @@ def _wheels(state: RobotState) -> dict[str, Any] | None:
     return {
         "armed": status.values.get(Key.ARMED) == "1",
         "message": status.message,
-        "level": status.level % len(LEVELS),
         "source": status.values.get(Key.SOURCE, ""),
     }
 

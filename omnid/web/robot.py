@@ -28,10 +28,8 @@ from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, 
 from omnid.errors import OmnidError
 from omnid.monitor.navigation import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
-from omnid.transport.topics import ROUTE, command_of
 from omnid.web.feed import OLDEST_S, RobotFeed, is_recent, server_ms
 
-LONGEST_BODY: Final = command_of(ROUTE).longest  # bytes
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
 _GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
 _STAMPED: Final = re.compile(r"(.*?)(?: stamp=(\d{1,15}))?", re.DOTALL)
@@ -67,7 +65,7 @@ class RobotPage:
         return [
             Route("/live", self.feed.live),
             Route("/image/{kind}", self.feed.image),
-            *(_command_route(f"/{name}", act) for name, act in commands.items()),
+            *(Route(f"/{name}", partial(_respond, act), methods=["POST"]) for name, act in commands.items()),
         ]
 
     @property
@@ -179,17 +177,13 @@ class RobotPage:
         return Answer(True, f"it drives by the stick: {velocity_mps:+.2f} m/s, {math.degrees(rate_radps):+.0f}°/s")
 
 
-def _command_route(path: str, act: Callable[[Request], Awaitable[Answer]]) -> Route:
-    """Return the address of a command, which comes by POST; the answer is JSON, with status 409 if it was not done."""
-
-    async def respond(request: Request) -> Response:
-        try:
-            answer = await act(request)
-        except OmnidError as error:
-            answer = Answer(False, str(error))
-        return JSONResponse(answer._asdict(), HTTPStatus.OK if answer.done else HTTPStatus.CONFLICT)
-
-    return Route(path, respond, methods=["POST"])
+async def _respond(act: Callable[[Request], Awaitable[Answer]], request: Request) -> Response:
+    """Return the answer to a command as JSON, with status 409 if it was not done."""
+    try:
+        answer = await act(request)
+    except OmnidError as error:
+        answer = Answer(False, str(error))
+    return JSONResponse(answer._asdict(), HTTPStatus.OK if answer.done else HTTPStatus.CONFLICT)
 
 
 def stamp_of(text: str) -> int:
@@ -205,10 +199,5 @@ def stamp_of(text: str) -> int:
 
 
 async def text_of(request: Request) -> str:
-    """Return the body of a request. Raise OmnidError above LONGEST_BODY bytes."""
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > LONGEST_BODY:
-            raise OmnidError(f"a request of at most {LONGEST_BODY} bytes was expected")
-    return body.decode("utf-8", "replace")
+    """Return the body of a request."""
+    return (await request.body()).decode("utf-8", "replace")

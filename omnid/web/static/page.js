@@ -140,8 +140,7 @@ function showPose(state) {
     ...(state.in_map === null ? [] : [["in the map", state.in_map]]),
     ...(nearest === null || !plan.obstacles.length ? [] : [["nearest obstacle", `${fixed(nearest[0], 2)} m, ${direction(nearest[1])}`]]),
     ["resets", `${pose.resets}`],
-    ...(state.pace ? [["simulated time", `${state.pace} x real time`]]
-      : [["image to here, median and 99 %", `${fixed(state.age_ms[0], 0)} and ${fixed(state.age_ms[1], 0)} ms`]]),
+    ...(state.pace ? [["simulated time", `${state.pace} x real time`]] : []),
     ["missed poses", `${state.missed}`],
   ];
   byId("pose").replaceChildren(...rows.map(([name, value]) => tableRow(name, value)));

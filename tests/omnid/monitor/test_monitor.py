@@ -21,9 +21,8 @@ from omnid.client import NavigationReport, Robot
 from omnid.core.control.heading_controller import VelocityLimits
 from omnid.errors import OmnidError
 from omnid.monitor import navigation
-from omnid.monitor.listen import pose_lines, print_state, status_table
 from omnid.monitor.navigation import stop
-from omnid.monitor.robot_state import ReceivedMessage, RobotState
+from omnid.monitor.robot_state import ReceivedMessage, RobotState, pose_lines, print_state, status_table
 from omnid.monitor.teleop import HOLD_S, Stick
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
@@ -78,12 +77,11 @@ def publish_until_it_ends(
     return process.communicate()
 
 
-def test_waits_for_the_robot_and_ends_with_a_signal() -> None:
+def test_shows_the_robot_and_ends_with_a_signal() -> None:
     endpoint = free_endpoint()
-    with listening("--robot", "rover", "--connect", endpoint) as it:
-        assert it.stderr is not None and endpoint in it.stderr.readline()
-        with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
-            out, err = publish_until_it_ends(bus, it, signal.SIGTERM)
+    rover = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
+    with rover as bus, listening("--robot", "rover", "--connect", endpoint) as it:
+        out, err = publish_until_it_ends(bus, it, signal.SIGTERM)
     assert it.returncode == 0 and err == "" and "\x1b" not in out
     last = out.splitlines()[-1]
     assert last.startswith("rover: tracking  ") and "x +0.500 y +0.250" in last
@@ -99,7 +97,7 @@ def test_a_wrong_name_is_reported() -> None:
 
 def received_message(number: int) -> ReceivedMessage:
     attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
-    return ReceivedMessage(time.time_ns(), "odom", odometry_at(number), attachment, time.monotonic_ns())
+    return ReceivedMessage("odom", odometry_at(number), attachment, time.monotonic())
 
 
 def received(*numbers: int) -> RobotState:
@@ -128,7 +126,7 @@ class Terminal(io.StringIO):
 def test_the_table_holds_no_control_characters_of_messages() -> None:
     state = received(1, 2)
     evil = [DiagnosticStatus(WHEELS, 2, "\x1b[2J\nhello", {"sent": "4"}), DiagnosticStatus(BUS, 0, "", {})]
-    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b"", 0))
+    state.process(ReceivedMessage("status", codec.diagnostics_cdr(1, evil), b"", 0.0))
     terminal = Terminal()
     print_state("omnid", state, terminal)
     shown = terminal.getvalue()

@@ -6,10 +6,8 @@ import http.client
 import json
 import os
 import resource
-import shutil
 import signal
 import socket
-import ssl
 import subprocess
 import sys
 import time
@@ -33,9 +31,8 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.status_names import BUS, CALIBRATION, WHEELS
-from omnid.web.access import Access, Role, token_of
+from omnid.web.server import Access, Role, token_of
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
-from tests.omnid.transport.test_access import authority
 from tests.omnid.web.servers import Shown, WebServer, served
 from tests.replay.command import Command
 from tests.waiting import PATIENCE_S, wait_until
@@ -54,9 +51,7 @@ def test_the_printed_address_lets_a_browser_in(server: WebServer) -> None:
     page = server.request("/", headers=server.cookie())
     assert page.status == 200 and "page.js" in page.text
     cookie = server.request(f"/?token={server.token}").headers["set-cookie"].lower()
-    assert "httponly" in cookie and "samesite=strict" in cookie
-    linked = server.request("/", headers={"Sec-Fetch-Site": "cross-site"})
-    assert linked.status == 200 and 'http-equiv="refresh"' in linked.text, "it loads again, with the cookie"
+    assert "httponly" in cookie and "samesite=lax" in cookie
 
 
 @pytest.mark.parametrize("path", ["/", "/static/page.js"])
@@ -200,32 +195,13 @@ def test_without_a_robot_the_page_says_so_and_a_stop_is_not_confirmed(default_si
     ("words", "expected"),
     [
         (("--listen", "nonsense"), "HOST:PORT"),
-        (("--listen", "192.0.2.1:0"), "another address"),
-        (("--tls-key", "key.pem"), "--tls-certificate"),
-        (("--tls-key", "/etc/hostname", "--tls-certificate", "/etc/hostname"), "in PEM"),
+        (("--listen", "192.0.2.1:0"), "free port"),
+        (("--listen", "127.0.0.1:70000"), "HOST:PORT"),
     ],
 )
 def test_wrong_options_are_refused(words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     listen = () if "--listen" in words else ("--listen", "127.0.0.1:0")
     assert expected in Command(capsys).refused("web", *listen, *words)
-
-
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
-def test_tls(tmp_path: Path) -> None:
-    authority(tmp_path, "page")
-    with served(
-        "--connect", free_endpoint(), "--tls-certificate", tmp_path / "page.pem", "--tls-key", tmp_path / "page.key"
-    ) as server:
-        assert server.url.startswith("https://")
-        context = ssl.create_default_context(cafile=str(tmp_path / "page.pem"))
-        context.check_hostname = False
-        connection = http.client.HTTPSConnection("127.0.0.1", server.port, timeout=PATIENCE_S, context=context)
-        connection.request("GET", f"/?token={server.token}")
-        cookie = connection.getresponse().getheader("set-cookie") or ""
-        assert "secure" in cookie.lower()
-        connection.close()
-        with pytest.raises((OSError, http.client.HTTPException)):
-            server.request("/")
 
 
 def test_the_journal_gets_no_token(tmp_path: Path) -> None:
