@@ -1,23 +1,98 @@
-"""Elements of a self-contained HTML page: head, tables, embedded images."""
+"""Elements of a self-contained HTML page: head, tables, embedded images, and charts over time.
+
+Charts are drawn by uPlot: one time, one zoom and one cursor for all.
+"""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import json
+import math
 import re
 from collections.abc import Sequence
+from functools import cache
 from html import escape
 from importlib.resources import files
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
+COLUMNS: Final = 400  # of a chart, in each of which the lowest and the highest value are kept
 Image = NDArray[np.uint8]
 
 # Control characters except tab and newline, which a terminal would obey where the page is printed.
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+class Curve(NamedTuple):
+    """A line of a chart."""
+
+    name: str
+    t_s: Array  # (N,) rising
+    values: Array  # (N,); NaN: unknown
+
+
+def chart(title: str, curves: Sequence[Curve], unit: str = "", *, log: bool = False, note: str = "") -> str:
+    """Return a figure; "" where all curves are empty. Lengths below 0.1 m are shown in mm."""
+    shown = []
+    for name, t_s, values in curves:
+        valid = np.isfinite(values) & ((values > 0) | (not log))
+        if valid.any():
+            shown.append(Curve(name, t_s[valid], values[valid]))
+    if not shown:
+        return ""
+    if unit == "m" and max(np.abs(values).max() for _, _, values in shown) < 0.1:
+        unit, shown = "mm", [Curve(name, t_s, 1e3 * values) for name, t_s, values in shown]
+    lines = [{"name": name, "points": thinned(t_s, values)} for name, t_s, values in shown]
+    data = escape(json.dumps({"lines": lines, "log": log, "unit": unit}, separators=(",", ":")))
+    caption = f"<b>{escape(title)}</b>{f' [{escape(unit)}]' if unit else ''}"
+    footnote = f"<small>{escape(note)}</small>" if note else ""
+    return (
+        f"<figure class='chart'><figcaption>{caption}</figcaption><div data-chart=\"{data}\"></div>{footnote}</figure>"
+    )
+
+
+def thinned(t_s: Array, values: Array) -> list[tuple[float, float | None]]:
+    """Return at most two points for each column, the lowest and the highest, and None in gaps of six usual steps."""
+    step = -(-len(t_s) // (2 * COLUMNS))
+    if step > 1:
+        starts = np.arange(0, len(t_s), 2 * step)
+        middles = np.minimum(starts + step, len(t_s) - 1)
+        bounds = [bound.reduceat(values, starts) for bound in (np.minimum, np.maximum)]
+        t_s, values = t_s[np.column_stack([starts, middles])].ravel(), np.column_stack(bounds).ravel()
+    steps_s = np.diff(t_s)
+    gaps = np.flatnonzero(steps_s > 6.0 * np.median(steps_s)) + 1 if len(steps_s) > 2 else np.zeros(0, int)
+    t_s, values = np.insert(t_s, gaps, (t_s[gaps - 1] + t_s[gaps]) / 2), np.insert(values, gaps, np.nan)
+    rounded = zip(t_s.round(3).tolist(), values.tolist(), strict=True)
+    return [(t, float(f"{value:.6g}") if math.isfinite(value) else None) for t, value in rounded]
+
+
+def grid(figures: Sequence[str]) -> str:
+    """Return figures side by side where there is room."""
+    return f"<div class='grid2'>{''.join(figures)}</div>" if any(figures) else ""
+
+
+@cache
+def colours() -> dict[str, tuple[int, int, int]]:
+    """Return the colours of the style sheet by their names, BGR, for what is drawn as an image."""
+    found = re.findall("--([a-z]+):#([0-9a-f]{6})", (files("omnid.report") / "report.css").read_text("utf-8"))
+    rgb = {name: bytes.fromhex(digits) for name, digits in found}
+    return {name: (blue, green, red) for name, (red, green, blue) in rgb.items()}
+
+
+@cache
+def style_and_script() -> tuple[str, str]:
+    """Return the style of a report with charts, and the script that draws them."""
+    found = (files("omnid.report") / "uplot.html").read_text("utf-8").strip()
+    licence, _, rest = found.partition("--><style>")
+    style, _, script = rest.partition("</style><script>")
+    licence = licence.removeprefix("<!--").strip()
+    own_style, own = ((files("omnid.report") / name).read_text("utf-8") for name in ("report.css", "charts.js"))
+    return style + own_style, f"/* {licence} */\n{script.removesuffix('</script>')}\n{own}"
 
 
 def page(title: str, parts: Sequence[str], style: str = "", script: str = "") -> str:

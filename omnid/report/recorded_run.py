@@ -16,7 +16,7 @@ import numpy as np
 from calib.errors import CalibError
 from calib.rig_file import parse_rig
 from omnid.formats.tum import POSITION_LIMIT_M
-from omnid.plain_text import MOST_ENTRIES, plain
+from omnid.plain_text import MOST_ENTRIES
 from omnid.recordings.recording import (
     CLOUD,
     DRIVE,
@@ -25,7 +25,7 @@ from omnid.recordings.recording import (
     TWIST_COMMAND,
     RecordingReader,
 )
-from omnid.report.charts import Array, Curve
+from omnid.report.page import Array, Curve
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import Cloud, Diagnostics, DiagnosticStatus, Pose, PoseInMap, TwistRecord
@@ -102,7 +102,7 @@ class RecordedRun:
                 case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:-1, -1]) <= POSITION_LIMIT_M).all():
                     map_xy.append(in_map.T_map_base[:2, -1])
                 case Diagnostics(stamp_ns, statuses):
-                    for status in map(_bounded, statuses):
+                    for status in statuses:
                         if status.name in entries or len(entries) < MOST_ENTRIES:
                             entries.setdefault(status.name, []).append((stamp_ns, status))
                 case Cloud():
@@ -223,9 +223,3 @@ class RecordedRun:
                     start_s, end_s = float(t_s[same[0] + 1]), float(t_s[same[-1] + 1])
                     text, count = _COUNTERS.get(key, key), int(rises[same].sum())
                     yield Event(start_s, end_s, WARNING, short_name(name), text, count)
-
-
-def _bounded(status: DiagnosticStatus) -> DiagnosticStatus:
-    """Return a status as the report shows it: with short texts, and not too many."""
-    values = {plain(key): plain(value) for key, value in [*status.values.items()][:MOST_ENTRIES]}
-    return DiagnosticStatus(plain(status.name), status.level, plain(status.message), values)

@@ -20,8 +20,7 @@ from omnid.formats.tum import Trajectory
 from omnid.plain_text import MOST_ENTRIES, plain, utc
 from omnid.recordings.evaluation import associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
-from omnid.report.charts import Array, Curve, chart, colours, grid, style_and_script
-from omnid.report.page import embedded, facts, note, page, table
+from omnid.report.page import Array, Curve, chart, colours, embedded, facts, grid, note, page, style_and_script, table
 from omnid.report.recorded_run import STATES, UNKNOWN, Event, RecordedRun
 from omnid.settings import changed, parse, value_at
 from omnid.transport import status_names
@@ -70,9 +69,6 @@ def _head(run: RecordedRun) -> list[str]:
     if len(known):
         tiles += [(name, f"{100 * (known == rank).mean():.1f} %") for rank, name in enumerate(STATES)]
         tiles.append(("resets", str(run.resets)))
-    p50, p99 = (_rounded(run.values(ODOMETRY).get(time_key(CAPTURE_TO_POSE, p), "")) for p in ("p50", "p99"))
-    if p50:
-        tiles.append(("image to pose, p50 / p99", f"{p50} / {p99} ms"))
     cells = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for name, value in tiles)
     # What is missing or doubtful in the log.
     lines = {

@@ -24,7 +24,7 @@ from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
 from omnid.formats.tum import Trajectory
 from omnid.recordings.evaluation import evaluate
-from omnid.report.charts import style_and_script
+from omnid.report.page import style_and_script
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
 from omnid.runs.session import attached_rig
