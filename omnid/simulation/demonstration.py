@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import Config
-from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.errors import OmnidError
 from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, draw_ends, draw_plan, sheet_of, with_legend
@@ -29,10 +29,9 @@ ROUTE: Final = "demo"
 DRIVE_S: Final = 90.0  # Longest drive in simulated time.
 STRAIGHT_M, RADIUS_M = 0.8, 0.7  # The oval that is taught: 6 m.
 LEGEND: Final = (  # colour (BGR) and width [px]
+    ("walls and boxes", LIGHT_GREY, 3),
     ("taught path", BLACK, 5),
     ("repeated path", RED, 2),
-    ("seen obstacles", (60, 60, 60), 9),  # a cell in which much was seen
-    ("walls and boxes", LIGHT_GREY, 3),
 )
 
 
@@ -44,35 +43,29 @@ def oval() -> Array:
     return np.vstack([(0.0, 0.0), right, left])
 
 
+@dataclass(slots=True)
 class TeachAndRepeat:
-    """The script: an operator drives an oval while the route is taught, then it is repeated. `show` takes lines."""
+    """A script: an operator drives an oval while the route is taught, then it is repeated. `show` takes lines."""
 
-    def __init__(self, show: Callable[[str], None]) -> None:
-        self._show = show
-        self.repeated_s = math.inf  # when the repetition began
-        self.end = ""  # in words
-        self._steps = self._drive()
-        next(self._steps)
+    show: Callable[[str], None]
+    repeated_s: float = math.inf  # when the repetition began
+    end: str = ""  # in words
 
-    def __call__(self, moment: Moment) -> Iterable[Request]:
-        """Return the next requests, once what was asked for has ended."""
-        return self._steps.send(moment)
-
-    def _drive(self) -> Generator[list[Request], Moment, None]:
-        """Yield the requests of each moment."""
+    def requests(self) -> Generator[list[Request], Moment, None]:
+        """Yield the requests of each moment, which is sent."""
         # 1. Arm the wheels.
         moment = yield []
         while moment.place is None or not moment.controller.armed:
             moment = yield [] if moment.place is None else ["arm"]
         # 2. Teach the route along an oval; a route of that name is from an earlier demonstration.
-        self._show(f"{moment.time_s:5.1f} s: is taught the route: it is driven along an oval")
+        self.show(f"{moment.time_s:5.1f} s: is taught the route: it is driven along an oval")
         teach = RouteRequest(RouteAction.TEACH, ROUTE, replace=True)
         moment = yield from self._ended([teach, PathRequest(NavigationFrame.ODOM, oval(), 0.0)])
         # 3. Repeat it, when its start is recognised.
         if self.end == NavigationState.REACHED:
             while moment.place is None or moment.place.state is not MapState.LOCALIZED:
                 moment = yield []
-            self._show(f"{moment.time_s:5.1f} s: repeats the route in the map that it has made")
+            self.show(f"{moment.time_s:5.1f} s: repeats the route in the map that it has made")
             self.repeated_s, self.end = moment.time_s, ""
             yield from self._ended([RouteRequest(RouteAction.FINISH), RouteRequest(RouteAction.REPEAT, ROUTE)])
         while True:
@@ -103,22 +96,19 @@ def demonstrate(image: Path, config: Config, seed: int, show: Callable[[str], No
     """
     # 1. The drive, and the true positions (N, 2) [m] of both rounds.
     world, script = load_world("room", seed), TeachAndRepeat(show)
-    run = simulate(world, make_robot(), script, seconds=DRIVE_S, seed=seed, config=config)
+    requests = script.requests()
+    next(requests)
+    run = simulate(world, make_robot(), requests.send, seconds=DRIVE_S, seed=seed, config=config)
     first, second = (
         np.array([tick.pose[:2] for tick in run.ticks if (tick.time_s >= script.repeated_s) == later]).reshape(-1, 2)
         for later in (False, True)
     )
-    # 2. The image: the world, both rounds, and the obstacles of all scans where the robot believes them.
-    directions, found = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(len(azimuths()))]), []
-    for scan in run.scans:
-        seen = np.isfinite(scan.ranges_m)
-        at = scan.ranges_m[seen, None] * directions[seen]
-        found.append(se3.apply(run.T_world_base[0] @ scan.T_odom_base, at)[:, :2])
-    obstacles, segments = np.vstack([np.zeros((0, 2)), *found]), world.obstacles(1.2)
-    sheet = sheet_of(obstacles, segments.reshape(-1, 2))
-    taught, repeated, _, walls = LEGEND
-    lines = [Lines(list(segments), *walls[1:]), Lines([first], *taught[1:]), Lines([second], *repeated[1:])]
-    drawn = draw_plan(sheet, obstacles, np.ones(len(obstacles), np.float32), lines)
+    # 2. The image: the world, and both rounds.
+    segments, nothing = world.obstacles(1.2), np.zeros((0, 2))
+    sheet = sheet_of(nothing, segments.reshape(-1, 2))
+    parts = (list(segments), [first], [second])
+    lines = [Lines(part, colour, width_px) for part, (_, colour, width_px) in zip(parts, LEGEND, strict=True)]
+    drawn = draw_plan(sheet, nothing, np.zeros(0, np.float32), lines)
     draw_ends(drawn, sheet, first[0])
     if not cv2.imwrite(str(image), with_legend(drawn, LEGEND)):
         raise OmnidError(f"{image}: cannot be written; name another folder by --output")

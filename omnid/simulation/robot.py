@@ -37,7 +37,6 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
-from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.world import Walkers, World, clearance_m
 
 CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.
@@ -51,30 +50,22 @@ TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")
 R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
 
 
-@dataclass(frozen=True, slots=True)
-class WheelErrors:
-    """Deviation of the wheels from those of the configuration.
-
-    Defaults: wheels measured by a ruler, not calibrated, on a hard floor. Their diameters are 1 % off and differ by
-    0.7 % (Borenstein, Feng 1996: unequal and wrong diameters, and the track, are the systematic errors). Noise adds to
-    the variance in proportion to the way (Chong, Kleeman 1997): of 10 m, 6 mm of each wheel.
-    """
-
-    left: float = 0.0135  # share by which the left wheel rolls farther than configured
-    right: float = 0.0065
-    noise: float = 0.002  # standard deviation of the travel of each wheel, per root of a metre [m]
-
-
 @dataclass(frozen=True)
 class SimulatedRobot:
-    """A disc with two driven wheels and two cameras; the motor controller is that of the configuration."""
+    """A disc with two driven wheels and two cameras; the motor controller is that of the configuration.
+
+    Wheels are measured by a ruler, not calibrated, on a hard floor: their diameters are 1 % off and differ by 0.7 %
+    (Borenstein, Feng 1996: unequal and wrong diameters, and the track, are the systematic errors). Noise adds to the
+    variance in proportion to the way (Chong, Kleeman 1997): of 10 m, 6 mm of each wheel.
+    """
 
     rig: Rig
     sensor: Sensor = field(default_factory=Sensor)
     radius_m: float = 0.2
     height_m: float = 1.2
     limits: MotionLimits = field(default_factory=lambda: MotionLimits(acceleration_mps2=1.5, lag_s=0.06))
-    wheels: WheelErrors = WheelErrors()
+    wheel_errors: tuple[float, float] = (0.0135, 0.0065)  # share by which left and right roll farther than configured
+    wheel_noise: float = 0.002  # standard deviation of the travel of each wheel, per root of a metre [m]
     gyro_bias_radps: tuple[float, float, float] = (0.004, -0.003, 0.006)  # about base x, y, z
     gyro_noise_radps: float = 0.003  # standard deviation of a sample
     gyro_hz: float = 100.0
@@ -128,8 +119,7 @@ class SimulatedCameras:
 
     def ideal(self, camera: Camera, T_world_rig: Array, people: Walkers) -> Floats:
         """Return the image (H, W) without the errors of a sensor."""
-        scene = Scene((*self.world.standing, *people.faces()))
-        return render_grey(scene, self.mounted[camera], T_world_rig, self.samples)
+        return render_grey((*self.world.standing, *people.faces()), self.mounted[camera], T_world_rig, self.samples)
 
 
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
@@ -272,10 +262,10 @@ class Vehicle:
 
     def travel_m(self, dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
         """Return the travel of the left and the right wheel over the ground for that of their rims in a time."""
-        wheels, noise = self.robot.wheels, self._wheel_noise.gauss
+        sigma, noise = self.robot.wheel_noise, self._wheel_noise.gauss
         left_m, right_m = (
-            travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * noise(0.0, 1.0)
-            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right))
+            travel_m * (1.0 + error) + sigma * math.sqrt(abs(travel_m)) * noise(0.0, 1.0)
+            for travel_m, error in zip((left_m, right_m), self.robot.wheel_errors, strict=True)
         )
         return left_m, right_m
 

@@ -149,30 +149,25 @@ class World:
         return self.brightness
 
     def footprints(self, rectangles: Sequence[Rectangle], height_m: float) -> Array:
-        """Return the outlines (N, 2, 2) [m] of rectangles on the floor, see `footprints`."""
-        return footprints(rectangles, height_m)
+        """Return the segments (N, 2, 2) [m] on the floor of all that reaches below a height, other than the floor.
+
+        Rectangles named "floor" are never met. Boxes and walls are closed by upright rectangles, so that their outlines
+        are enough.
+        """
+        segments = []
+        for rectangle in rectangles:
+            corners = rectangle.corners
+            low_m, high_m = corners[:, 2].min(), corners[:, 2].max()
+            if rectangle.name != "floor" and high_m - low_m > FLOOR_M and low_m < height_m and high_m > FLOOR_M:
+                spread = corners[:, :2] - corners[0, :2]
+                far = int(np.argmax((spread**2).sum(axis=1)))
+                other = int(np.argmax(((corners[:, :2] - corners[far, :2]) ** 2).sum(axis=1)))
+                segments.append(corners[[far, other], :2])
+        return np.array(segments).reshape(-1, 2, 2)
 
     def obstacles(self, height_m: float) -> Array:
         """Return the segments (N, 2, 2) [m] of all that a robot of a height may touch."""
         return self.footprints(self.standing, height_m)
-
-
-def footprints(rectangles: Sequence[Rectangle], height_m: float) -> Array:
-    """Return the segments (N, 2, 2) [m] on the floor of all that reaches below a height, other than the floor.
-
-    Rectangles named "floor" are never met. Boxes and walls are closed by upright rectangles, so that their outlines are
-    enough.
-    """
-    segments = []
-    for rectangle in rectangles:
-        corners = rectangle.corners
-        low_m, high_m = corners[:, 2].min(), corners[:, 2].max()
-        if rectangle.name != "floor" and high_m - low_m > FLOOR_M and low_m < height_m and high_m > FLOOR_M:
-            spread = corners[:, :2] - corners[0, :2]
-            far = int(np.argmax((spread**2).sum(axis=1)))
-            other = int(np.argmax(((corners[:, :2] - corners[far, :2]) ** 2).sum(axis=1)))
-            segments.append(corners[[far, other], :2])
-    return np.array(segments).reshape(-1, 2, 2)
 
 
 def distances_m(segments: Array, places: Array) -> Array:

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 from importlib.resources import files
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -25,9 +26,8 @@ from msgspec.structs import asdict
 
 from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
-from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.surfaces import CEILING_M, Point, Rectangle, box, painted, poster_paint, posters, solid
-from omnid.simulation.rendering.textures import Random, Texture
+from omnid.simulation.rendering import surfaces
+from omnid.simulation.rendering.surfaces import CEILING_M, Point, Random, Rectangle
 from omnid.simulation.world import Person, World
 
 MAX_BYTES: Final = 1 << 18
@@ -38,10 +38,10 @@ Distance: TypeAlias = Annotated[float, Meta(ge=0.0, le=100.0)]  # m
 Size: TypeAlias = tuple[Side, Side, Side]
 Path: TypeAlias = Annotated[tuple[Point, ...], Meta(min_length=2, max_length=100)]
 Many: Final = Meta(max_length=200)
-if TYPE_CHECKING:
-    Painted: TypeAlias = str
-else:
-    Painted = Literal[tuple(textures.PAINTERS)]
+# Of surfaces.PAINTERS.
+Texture: TypeAlias = Literal[
+    "brick", "plaster", "granite", "tiles", "plain", "white", "linoleum", "epoxy", "marbled", "carpet"
+]
 
 
 class Door(Struct, frozen=True, order=True):
@@ -56,7 +56,7 @@ class Wall(Struct, frozen=True):
     """A wall along a polyline; doors are in the first part of it."""
 
     points: Path
-    texture: Literal["brick", "plaster", "granite", "tiles", "plain", "white", "random"] = "random"
+    texture: Texture | Literal["random"] = "random"
     height_m: Side | None = None  # None: up to the ceiling
     posters_per_m: Annotated[float, Meta(ge=0.0, le=4.0)] = 0.0
     poster_sides: Literal["front", "both"] = "front"
@@ -70,7 +70,7 @@ class Box(Struct, frozen=True):
     size_m: Size
     bottom_m: Distance = 0.0  # over the floor
     yaw_deg: float = 0.0
-    texture: Literal["brick", "plaster", "granite", "tiles", "plain", "white", "poster"] = "poster"
+    texture: Texture | Literal["poster"] = "poster"
 
 
 class Walker(Struct, frozen=True):
@@ -91,8 +91,8 @@ class Space(Struct, frozen=True):
     low: Point
     high: Point
     ceiling_m: Annotated[float, Meta(ge=1.5, le=20.0)] = CEILING_M
-    floor: Painted = "tiles"
-    ceiling: Painted = "tiles"
+    floor: Texture = "tiles"
+    ceiling: Texture = "tiles"
 
     @property
     def sides_m(self) -> Point:
@@ -103,7 +103,8 @@ class Space(Struct, frozen=True):
         """Return the painted floor and ceiling."""
         (x0, y0), (_, y1), (width, depth) = self.low, self.high, self.sides_m
         along, across = np.array([width, 0.0, 0.0]), np.array([0.0, depth, 0.0])
-        floor, ceiling = (painted(rng, kind, self.sides_m, FLOOR_PX_PER_M) for kind in (self.floor, self.ceiling))
+        kinds = self.floor, self.ceiling
+        floor, ceiling = (surfaces.painted(rng, kind, self.sides_m, FLOOR_PX_PER_M) for kind in kinds)
         return [
             Rectangle(np.array([x0, y1, 0.0]), along, -across, floor, "floor"),
             Rectangle(np.array([x0, y0, self.ceiling_m]), along, across, ceiling, "ceiling"),
@@ -173,7 +174,7 @@ def _wall(rng: Random, wall: Wall, height_m: float) -> list[Rectangle]:
         if height_m >= CEILING_M - 0.2 and part.height_m > 0.8 * height_m and part.width_m > 0.6:
             behind = replace(part, origin=part.origin + part.edge_u, edge_u=-part.edge_u)
             for side in (part, behind)[: 2 if wall.poster_sides == "both" else 1]:
-                hung += posters(rng, side, round(wall.posters_per_m * part.width_m), len(hung))
+                hung += surfaces.posters(rng, side, round(wall.posters_per_m * part.width_m), len(hung))
     return parts + hung
 
 
@@ -195,21 +196,19 @@ def _pieces(
     for begin_m, end_m, low_m in pieces:
         end_m = min(end_m, length_m)
         if end_m - begin_m > 0.01 and height_m - low_m > 0.01:
-            texture = painted(rng, kind, (end_m - begin_m, height_m - low_m), PX_PER_M)
+            texture = surfaces.painted(rng, kind, (end_m - begin_m, height_m - low_m), PX_PER_M)
             corner, down = a + begin_m * along + height_m * up, (low_m - height_m) * up
             walls.append(Rectangle(corner, (end_m - begin_m) * along, down, texture, kind))
     return walls
 
 
 def _box(rng: Random, entry: Box) -> list[Rectangle]:
-    def paint(sides_m: Point) -> Texture:
-        return painted(rng, entry.texture, sides_m)
-
+    paint = partial(surfaces.painted, rng, entry.texture)
     at, yaw_rad = (*entry.at, entry.bottom_m), math.radians(entry.yaw_deg)
-    is_poster = entry.texture == "poster"
-    return solid(at, entry.size_m, yaw_rad, poster_paint(rng) if is_poster else paint, is_raised=entry.bottom_m > 0)
+    chosen = surfaces.poster_paint(rng) if entry.texture == "poster" else paint
+    return surfaces.solid(at, entry.size_m, yaw_rad, chosen, is_raised=entry.bottom_m > 0)
 
 
 def _person(rng: Random, walker: Walker) -> Person:
     walk = asdict(walker)
-    return Person(tuple(box(rng, (0.0, 0.0), walk.pop("size_m"), 0.0)), **walk)
+    return Person(tuple(surfaces.box(rng, (0.0, 0.0), walk.pop("size_m"), 0.0)), **walk)

@@ -30,7 +30,7 @@ from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
-from omnid.simulation.rendering.textures import poster
+from omnid.simulation.rendering.surfaces import poster
 from omnid.simulation.robot import START_NS, make_robot
 from omnid.simulation.world import World, cross_track_m
 from omnid.simulation.world_file import load_world

@@ -147,7 +147,7 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
     asked = trial(planned.world, planned.seed, planned.floor)
     robot = asked.robot(planned.size_px)
     if planned.has_photographs:
-        standing = with_photographs(Scene(asked.world.standing), planned.seed).rectangles
+        standing = with_photographs(Scene(asked.world.standing), planned.seed)
         asked = replace(asked, world=replace(asked.world, standing=standing))
     x_m, y_m, heading_rad = asked.world.start
     if asked.motion == "ahead" and asked.goal is None:

@@ -16,8 +16,7 @@ from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
-from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.simulation.rendering.textures import value_noise
+from omnid.simulation.rendering.surfaces import Rectangle, Scene, value_noise
 
 # Side of a square in the board's texture.
 SQUARE_PX = 24

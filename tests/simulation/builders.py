@@ -8,9 +8,18 @@ from functools import lru_cache
 import numpy as np
 
 from calib.models.camera import Array
-from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.surfaces import CEILING_M, PX_PER_M, Point, Rectangle, Scene, box, painted, posters
-from omnid.simulation.rendering.textures import Random
+from omnid.simulation.rendering import surfaces
+from omnid.simulation.rendering.surfaces import (
+    CEILING_M,
+    PX_PER_M,
+    Point,
+    Random,
+    Rectangle,
+    Scene,
+    box,
+    painted,
+    posters,
+)
 from tests.simulation.paths import planar_poses
 
 # Number of worlds of each kind that are kept, as many tests show the same; their textures are a few megabytes each.
@@ -131,7 +140,7 @@ def ring(seed: int) -> Scene:
 def _floor_and_ceiling(rng: Random, size_m: Point) -> list[Rectangle]:
     along, across = np.array([size_m[0], 0, 0]), np.array([0, size_m[1], 0])
     size = (round(size_m[0] * FLAT_PX_PER_M), round(size_m[1] * FLAT_PX_PER_M))
-    floor, ceiling = (textures.tiles(rng, size, FLAT_PX_PER_M) for _ in range(2))
+    floor, ceiling = (surfaces.tiles(rng, size, FLAT_PX_PER_M) for _ in range(2))
     return [
         Rectangle(across, along, -across, floor, "floor"),
         Rectangle(np.array([0, 0, CEILING_M]), along, across, ceiling, "ceiling"),
@@ -193,14 +202,14 @@ def _centre_line(share: Array) -> tuple[Array, Array]:
 def twin_corridor(seed: int, period_m: float = 6.0) -> Scene:
     """Return a corridor whose second half repeats the first one in every texture, poster and box."""
     first = corridor(seed, period_m)
-    again = tuple(replace(r, origin=r.origin + np.array([period_m, 0, 0])) for r in first.rectangles if not _is_end(r))
+    again = tuple(replace(r, origin=r.origin + np.array([period_m, 0, 0])) for r in first if not _is_end(r))
     return Scene(
         (
-            *(r for r in first.rectangles if not _is_end(r) or r.origin[0] < 0),
+            *(r for r in first if not _is_end(r) or r.origin[0] < 0),
             *again,
             *(
                 replace(r, origin=r.origin + np.array([period_m, 0, 0]))
-                for r in first.rectangles
+                for r in first
                 if _is_end(r) and r.origin[0] > 0
             ),
         )
@@ -216,7 +225,7 @@ def _is_end(rectangle: Rectangle) -> bool:
 def bricks(seed: int, length_m: float = 10.0) -> Scene:
     """Return a corridor of nothing but identical bricks and two plain ends."""
     scene = corridor(seed, length_m, ("brick", "brick", "brick", "brick", "brick"), posters_per_8m=0)
-    return Scene(tuple(r for r in scene.rectangles if r.name not in ("box",)))
+    return Scene(tuple(r for r in scene if r.name not in ("box",)))
 
 
 def symmetric_room(seed: int, size_m: Point = (6.0, 5.0)) -> Scene:
@@ -226,7 +235,7 @@ def symmetric_room(seed: int, size_m: Point = (6.0, 5.0)) -> Scene:
     sides = [wall(rng, "granite", (-x, y), (x, y)), wall(rng, "plaster", (x, y), (x, -y))]
     turn = np.diag([-1.0, -1.0, 1.0])
     opposite = [Rectangle(turn @ r.origin, turn @ r.edge_u, turn @ r.edge_v, r.texture, r.name) for r in sides]
-    half = textures.tiles(rng, (round(size_m[0] * PX_PER_M / 2), round(size_m[1] * PX_PER_M / 4)), PX_PER_M / 2)
+    half = surfaces.tiles(rng, (round(size_m[0] * PX_PER_M / 2), round(size_m[1] * PX_PER_M / 4)), PX_PER_M / 2)
     both = np.ascontiguousarray(np.vstack([half, half[::-1, ::-1]]))
     across, along = np.array([0, size_m[1], 0]), np.array([size_m[0], 0, 0])
     floor = Rectangle(np.array([-x, y, 0]), along, -across, both, "floor")
@@ -244,7 +253,7 @@ def repeating(seed: int, length_m: float, period_m: float = 0.3) -> Scene:
     return Scene(
         tuple(
             replace(r, origin=r.origin + back, texture=_repeated(r, period_m))
-            for r in scene.rectangles
+            for r in scene
             if not r.name.startswith("box")
         )
     )

@@ -15,15 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.models.camera import Array
-from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.surfaces import CEILING_M, Paint, Point, Rectangle, pixels_of, solid
-from omnid.simulation.rendering.textures import (
+from omnid.simulation.rendering import surfaces
+from omnid.simulation.rendering.surfaces import (
+    CEILING_M,
     PAINTERS,
+    Paint,
     Painter,
+    Point,
     Random,
+    Rectangle,
     Size,
     Texture,
     grey_of,
+    pixels_of,
+    solid,
     stretched,
     value_noise,
 )
@@ -67,7 +72,7 @@ def plain_paint(rng: Random, grey: float, grain: float = 0.8, px_per_m: float = 
 
 def poster_paint(rng: Random) -> Paint:
     """Return what paints a face as a printed page, a drawing or a photograph."""
-    return lambda sides_m: textures.poster(rng, _px(sides_m))
+    return lambda sides_m: surfaces.poster(rng, _px(sides_m))
 
 
 class Builder:
@@ -175,7 +180,7 @@ class Builder:
                     self._window(first, along, left_m, size_m)
                 else:
                     height_m = rng.uniform(0.3, 0.6)
-                    page = textures.poster(rng, (150, round(300 * height_m)))
+                    page = surfaces.poster(rng, (150, round(300 * height_m)))
                     self._hang(first, along, (left_m, 0.5), (1.3, 1.3 + height_m), page, "poster", 0.01)
         if skirting:
             for begin_m, end_m in full:

@@ -25,8 +25,7 @@ from calib.models.camera import Array, Mask
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats
-from omnid.simulation.rendering.surfaces import POSTER_GAP_M, Rectangle, Scene
-from omnid.simulation.rendering.textures import Texture
+from omnid.simulation.rendering.surfaces import POSTER_GAP_M, Rectangle, Scene, Texture
 
 REFRACTIVE_INDEX: Final = 1.5  # of glass, glazed tiles, polish and lacquer
 WHITE: Final[Texture] = np.full((8, 8), 255, np.uint8)
@@ -66,7 +65,7 @@ class Mirror:
     def reflected(self, image: Floats, scene: Scene, surface: Rectangle, T_world_rig: Array, samples: int) -> Floats:
         """Return the ideal image (H, W) of a scene with what a surface mirrors; the scene may hold it, or not."""
         # 1. The part of each pixel that shows the surface, times what it reflects at the pixel's angle.
-        others = [face for face in scene.rectangles if face is not surface]
+        others = [face for face in scene if face is not surface]
         shown = seen_part(replace(surface, texture=WHITE), others, self._mounted, T_world_rig, 1)
         if not shown.any():
             return image

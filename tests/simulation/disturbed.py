@@ -21,7 +21,7 @@ from omnid.simulation.lockstep import Drive, SimulatedRun
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedCameras, SimulatedRobot, Vehicle
-from omnid.simulation.world import Walkers, World, footprints
+from omnid.simulation.world import Walkers, World
 from tests.simulation.disturbances import Mirror, seen_part
 
 HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor
@@ -107,7 +107,7 @@ class BuildingWorld(World):
             replace(rectangle, origin=rectangle.origin - (0.0, 0.0, z_m)) if z_m else rectangle
             for rectangle, z_m in zip(rectangles, down_m, strict=True)
         ]
-        return footprints(lowered, height_m)
+        return super().footprints(lowered, height_m)
 
     def obstacles(self, height_m: float) -> Array:
         """Return the segments (N, 2, 2) of all that stands, of the panes, and of the edges of the floor."""
@@ -129,11 +129,11 @@ class BuildingCameras(SimulatedCameras):
         ideal, world = super().ideal(camera, T_world_rig, people), self.world
         if isinstance(world, BuildingWorld):
             scene = Scene((*world.standing, *people.faces()))
-            for mirror in (*[scene.named("floor")][: world.is_polished], *world.panes):
+            for mirror in (*[next(face for face in scene if face.name == "floor")][: world.is_polished], *world.panes):
                 ideal = self.mirrors[camera].reflected(ideal, scene, mirror, T_world_rig, self.samples)
             for patch in world.sun:
                 lit = patch.rectangle(people.time_s)
-                shown = seen_part(lit, scene.rectangles, self.mounted[camera], T_world_rig, self.samples)
+                shown = seen_part(lit, scene, self.mounted[camera], T_world_rig, self.samples)
                 ideal = np.asarray(ideal * (1 + np.float32(patch.gain) * shown), np.float32)
         return ideal * np.float32(not self.is_dark)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.surfaces import Paint, Point, Rectangle, painted, solid
-from omnid.simulation.robot import WheelErrors
+from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.world import Person, moved
 from tests.simulation import harmless_worlds
 from tests.simulation.building_parts import (
@@ -357,7 +357,7 @@ def _robot(b: Builder, **changes: object) -> Trial:
     return Trial(built(b), changes=tuple(changes.items()))
 
 
-USUAL: Final = WheelErrors()
+LEFT, RIGHT = SimulatedRobot.wheel_errors
 CROSSING: Final = ("straight", "diagonally", "like_the_floor", "two", "from_a_door", "turns_round")
 NEAR: Final = ("white_pole", "textured_pole", "box", "person")
 ALL_THINGS: Final = (*THINGS, "trolley")
@@ -367,7 +367,7 @@ OF_ROBOT: Final[Makers] = {
     "pushed": (None, partial(_robot, pushes=(Push(5.0, 5.5, 0.3, 0.15), Push(11.0, 11.5, -0.3, -0.15)))),
     "slip_20": (None, partial(_robot, slips=(Slip(5.0, 7.0, 0.2), Slip(12.0, 14.0, 0.2)))),
     "slip_40": (None, partial(_robot, slips=(Slip(8.0, 10.0, 0.4),))),
-    "weak_motor": (None, partial(_robot, wheels=replace(USUAL, left=USUAL.left - 0.08))),
+    "weak_motor": (None, partial(_robot, wheel_errors=(LEFT - 0.08, RIGHT))),
 }
 MAKERS: Final[Makers] = {
     **harmless_worlds.MAKERS,

@@ -12,8 +12,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.simulation.rendering.textures import PAINTERS, Random, Texture
+from omnid.simulation.rendering.surfaces import PAINTERS, Random, Rectangle, Scene, Texture
 
 SURFACES: Final = ("brick.png", "gravel.png", "grass.png")  # each of 512x512 px, evenly lit
 SURFACE_M: Final = 1.2  # width of a photograph of a surface
@@ -36,7 +35,7 @@ def with_photographs(scene: Scene, seed: int) -> Scene:
     Faces of boxes are pictures, too; the ceiling stays.
     """
     rng = np.random.default_rng([seed, 53])
-    return Scene(tuple(_painter(face)(rng, face) for face in scene.rectangles))
+    return Scene(tuple(_painter(face)(rng, face) for face in scene))
 
 
 def _painter(face: Rectangle) -> Callable[[Random, Rectangle], Rectangle]:

@@ -21,12 +21,10 @@ from calib import se3
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.caster_kernels import cast
-from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.simulation.rendering.textures import Texture
+from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 Floats = NDArray[np.float32]
 TILE_PX = 32  # samples along a tile's side
-RAY_CHUNK = 1 << 18  # Pixels lifted at once, which bounds memory.
 KEPT = 6  # Number of cameras whose rays are kept, and of scenes whose textures are.
 # Rounding of float32 rays: of angles [rad] near the axis of a cone, and as a share of distances.
 ROUNDING = 2 * float(np.sqrt(np.finfo(np.float32).eps))
@@ -77,7 +75,7 @@ def ray_table(camera: OmniCamera, mask: Mask, supersample: int) -> RayTable:
     width, height = (side * supersample for side in camera.size)
     columns, lines = -(-width // TILE_PX), -(-height // TILE_PX)
     rays, origins, spacing = _lifted(camera, supersample)  # type: ignore[arg-type]  # cameras are frozen
-    seen = mask.contains(np.concatenate(_sample_pixels(camera.size, supersample)))
+    seen = mask.contains(_sample_pixels(camera.size, supersample))
     row, column = np.divmod(np.arange(height * width), width)
     tile = row // TILE_PX * columns + column // TILE_PX
     index = np.flatnonzero(seen & np.isfinite(rays[:, 0]) & np.isfinite(spacing))
@@ -94,11 +92,10 @@ def ray_table(camera: OmniCamera, mask: Mask, supersample: int) -> RayTable:
     )
 
 
-def _sample_pixels(size: tuple[int, int], supersample: int) -> list[Array]:
-    """Return the pixels (N, 2) of all samples, row by row, in chunks of about RAY_CHUNK."""
+def _sample_pixels(size: tuple[int, int], supersample: int) -> Array:
+    """Return the pixels (N, 2) of all samples, row by row."""
     u, v = ((np.arange(side * supersample) + 0.5) / supersample - 0.5 for side in size)
-    pixels = np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
-    return np.array_split(pixels, -(-len(pixels) // RAY_CHUNK))
+    return np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
 
 
 @lru_cache(1)
@@ -108,13 +105,11 @@ def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats, Float
     Origins (1, 3) of a central camera. Computed once for the equal lenses of a rig.
     """
     width, height = camera.size
-    chunks = _sample_pixels(camera.size, supersample)
-    rays = np.concatenate([camera.lift(pixels) for pixels in chunks])
+    pixels = _sample_pixels(camera.size, supersample)
+    rays = camera.lift(pixels)
     grid = rays.reshape(height * supersample, width * supersample, 3)
     solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
-    origins = np.zeros((1, 3))
-    if isinstance(camera, NonCentralCamera):
-        origins = np.concatenate([camera.rays(pixels)[0] for pixels in chunks])
+    origins = camera.rays(pixels)[0] if isinstance(camera, NonCentralCamera) else np.zeros((1, 3))
     return rays.astype(np.float32), origins.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
 
 
@@ -149,14 +144,14 @@ def render_grey(
     reach_m = float(np.linalg.norm(table.origins, axis=0).max())
     reach_m += float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
     # 2. The rectangles in the frame of the first pose by their least distance, and those that tiles may see.
-    corners = se3.apply(se3.inverse(poses[0]), corners_of(scene.rectangles))
+    corners = se3.apply(se3.inverse(poses[0]), corners_of(scene))
     distance_m = _distances_m(corners)
     order = np.argsort(distance_m, kind="stable")
     corners, distance_m = corners[order], distance_m[order]
-    surfaces = _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m - reach_m)
+    surfaces = _surfaces([scene[i] for i in order], poses[0], distance_m - reach_m)
     seen = tiles_that_see(table, corners, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
     # 3. The greys of all samples.
-    atlas, image = cached_atlas([r.texture for r in scene.rectangles]), np.zeros(width * height, np.float32)
+    atlas, image = cached_atlas([r.texture for r in scene]), np.zeros(width * height, np.float32)
     cast(
         table.rays,
         table.origins,

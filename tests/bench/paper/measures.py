@@ -40,7 +40,7 @@ def cast(scene: Scene, origin: Array, rays: Array) -> tuple[Array, Indices]:
     Distances are in units of each ray; inf and -1 where nothing is hit.
     """
     nearest, which = np.full(len(rays), np.inf), np.full(len(rays), -1)
-    for number, rectangle in enumerate(scene.rectangles):
+    for number, rectangle in enumerate(scene):
         distance = _intersect(rectangle, origin, rays)
         nearer = distance < nearest
         nearest[nearer], which[nearer] = distance[nearer], number
@@ -72,7 +72,7 @@ def sees(scene: Scene, origin: Array, points: Array, slack_m: float = 0.02) -> F
 def surface_distance_m(scene: Scene, points: Array) -> Array:
     """Return the distance (N,) of points (N, 3) from the nearest surface."""
     nearest = np.full(len(points), np.inf)
-    for r in scene.rectangles:
+    for r in scene:
         uv = np.clip(_fractions(r, points), 0, 1)
         nearest = np.minimum(nearest, np.linalg.norm(points - r.points(uv), axis=1))
     return nearest
@@ -101,7 +101,7 @@ class WallFigures(NamedTuple):
 def walls(folder: Path, experiment: Experiment) -> dict[str, WallFigures]:
     """Return the figures of each method on the matches that truly show the wall."""
     run, views, stereo = experiment.run, Views.load(folder), Config().stereo
-    wall = next(face for face in run.scene.rectangles if face.name == "wall")
+    wall = next(face for face in run.scene if face.name == "wall")
     squares = round(2 * WALL_M * np.tan(np.deg2rad(HALF_ANGLE_DEG)) / CELL_M) * round(wall.height_m / CELL_M)
     found = {}
     for name, method in SAD_METHODS.items():
@@ -131,7 +131,7 @@ def _wall_points(run: SimulatedRun, views: Views, T_world_rig: Array, pixels: Ar
     rays = views.rays(pixels) @ T_world_rig[:3, :3].T
     origin = views.viewpoint(T_world_rig)
     distance, which = cast(run.scene, origin, rays)
-    wall = [number for number, face in enumerate(run.scene.rectangles) if face.name == "wall"]
+    wall = [number for number, face in enumerate(run.scene) if face.name == "wall"]
     ahead = np.abs(np.arctan2(rays[:, 1], rays[:, 0])) <= np.deg2rad(HALF_ANGLE_DEG)
     return np.isin(which, wall) & ahead, origin + np.where(np.isfinite(distance), distance, 0)[:, None] * rays
 

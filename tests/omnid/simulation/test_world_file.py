@@ -149,7 +149,7 @@ def corner_errors_px(mounted: MountedCamera) -> np.ndarray:
     """Return the distance of every visible corner in the image from its projection."""
     scene = chessboards(POSE)
     image = render(scene, mounted, POSE, 3)
-    expected = project(mounted, np.concatenate([inner_corners(s) for s in scene.rectangles]))
+    expected = project(mounted, np.concatenate([inner_corners(s) for s in scene]))
     expected = expected[mounted.visible.contains(expected, 8)]
     start = np.ascontiguousarray(expected + 0.7, np.float32)
     enough = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3)
