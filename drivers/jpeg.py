@@ -43,9 +43,10 @@ def coding_sigma(steps: Steps, highest: int) -> float:
     """Return the standard deviation [grey levels] of the error of quantisation in the lowest frequencies of blocks.
 
     steps: as of `quantisation_steps`, (): 0. highest: the first of a block's 8 frequencies along rows and columns that
-    does not count. An error is uniform within a step, so its variance is a twelfth of the square of the step; the
-    transform is orthonormal (A.3.3), so that of a pixel is a 64th of their sum. The mean grey of blocks does not count:
-    it varies little within a window of some blocks. Contrast below a step is lost; its error is the contrast itself.
+    does not count. An error is uniform within a step, so its variance is a twelfth of the square of the step. The
+    transform is orthonormal (A.3.3), so the variance of a pixel is a 64th of the sum of these variances. The mean grey
+    of a block does not count: it varies little within a window of some blocks. Contrast below a step is lost; its error
+    is the contrast itself.
     """
     if not steps:
         return 0.0

@@ -4,7 +4,7 @@ Reads an IMU of WitMotion (WT61, WT901 ...) and publishes each angular velocity 
 any program may do for any other gyro. Set the IMU to 115200 baud and 100 Hz with its maker's program, and state its
 orientation on the base by motion.imu_rpy_deg of the robot's settings.
 
-The IMU sends packets of 11 bytes unasked: 0x55, a type, four little-endian numbers of 16 bits, and the sum of the ten
+The IMU sends packets of 11 bytes by itself: 0x55, a type, four little-endian numbers of 16 bits, and the sum of the ten
 bytes before. Type 0x52 holds the angular velocities about x, y, z in units of 2000 / 32768 degrees per second.
 """
 
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     received = bytearray()
     try:
         with serial.Serial(args.port, args.baud, timeout=0.1, exclusive=True) as port:
-            port.reset_input_buffer()  # what has arrived before is of an unknown time
+            port.reset_input_buffer()  # The time of bytes that have arrived before is unknown.
             while True:
                 received += port.read(max(1, port.in_waiting))
                 now_ns = time.time_ns()

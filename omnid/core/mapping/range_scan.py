@@ -52,7 +52,7 @@ def seen_from(free_m: FreeRanges, T_view_base: Array) -> FreeRanges:
     x, y, _ = se3.apply(T_view_base, free_m[:, None] * directions).T
     nearest = np.full(SECTORS, np.inf)
     np.minimum.at(nearest, _sectors(x, y), np.where(free_m > 0, np.hypot(x, y), 0.0))
-    # An end between two sectors belongs to either side.
+    # The end of a free range may lie on the border of two sectors: it counts for the sectors on both sides.
     nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1), np.roll(nearest, -1)))
     return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
 
@@ -99,8 +99,8 @@ def point_scan(
     #    base: 2 % of the points of the floor are beyond it.
     low, high = heights_m
     across2, rise2 = ((points[:, :2] - view[:2]) ** 2).sum(axis=1), (points[:, 2] - view[2]) ** 2
-    of_stereo2 = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
-    margin = 2 * np.sqrt(of_stereo2 + tilt_rad**2 * across2 + floor_sigma_m**2)
+    stereo_variance = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
+    margin = 2 * np.sqrt(stereo_variance + tilt_rad**2 * across2 + floor_sigma_m**2)
     x, y, z = points.T
     ranges = np.hypot(x, y)
     chosen = (ranges > NEAREST_M) & np.isfinite(sigma_m) & (z - margin > low) & (z + margin < high)
@@ -115,8 +115,8 @@ def point_scan(
     of_neighbours = count + np.roll(count, 1, axis=0) + np.roll(count, -1, axis=0)
     supported = (of_neighbours >= min_points) & (count > 0)
     first = supported.argmax(axis=1)[:, None]
-    total, of_inverse = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))
-    found = np.divide(total, of_inverse, out=np.full(SECTORS, np.nan), where=supported.any(axis=1))
+    point_count, inverse_sum = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))
+    found = np.divide(point_count, inverse_sum, out=np.full(SECTORS, np.nan), where=supported.any(axis=1))
     return fill_gaps(np.where(found > MAX_RANGE_M, np.nan, found).astype(np.float32))
 
 
