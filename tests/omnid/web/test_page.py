@@ -32,7 +32,7 @@ from tests.waiting import PATIENCE_S, wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
-SIZES = {"phone": (390, 844), "desk": (1366, 768)}
+SIZES = {"phone": (390, 844), "laptop": (1280, 800), "desk": (1366, 768)}
 # What drives the robot is on the screen without scrolling; routes are beside it, on a phone below.
 CONTROLS = ("arm", "goal", "stick", "fit")
 HOSTILE = "<img src=x onerror=document.title='hacked'><script>document.title='hacked'</script>"
@@ -163,7 +163,7 @@ def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
     with contextlib.ExitStack() as ends:
         bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
         server = ends.enter_context(served("--connect", endpoint))
-        for size in ("phone", "desk"):
+        for size in SIZES:
             with opened(browser, server, size) as page:
                 end_s = time.monotonic() + PATIENCE_S
                 while not (
