@@ -163,10 +163,9 @@ def _stored(job: Job) -> dict[str, Any] | None:
     """Return the result of an earlier run of the same job, None without one."""
     try:
         result: dict[str, Any] = json.loads((job.folder / RESULT_FILE).read_text())
-        is_done = result["seen"] == job.seen and result["status"] in DONE.values()
+        return result if result["seen"] == job.seen and result["status"] in DONE.values() else None
     except (OSError, ValueError, TypeError, KeyError):
         return None
-    return result if is_done else None
 
 
 def _client(scheduler: str | None, jobs: int) -> Any:

@@ -289,9 +289,8 @@ def import_rig(args: argparse.Namespace) -> int:
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(T_upper_lower))))
     lower, upper = (model_in_words(mounted.camera) for mounted in (rig.lower, rig.upper))
-    turned = f"upper rotated by {rotation_deg:.2f} deg"
-    print(f"{args.output}: lower {lower}, upper {upper}, baseline {1e3 * rig.baseline_m:.1f} mm, {turned}")
-    print(f"{args.output}: {height_of(rig)}")
+    placed = f"baseline {1e3 * rig.baseline_m:.1f} mm, upper rotated by {rotation_deg:.2f} deg, {height_of(rig)}"
+    print(f"{args.output}: lower {lower}, upper {upper}, {placed}")
     return 0
 
 

@@ -113,11 +113,10 @@ def doctor(args: argparse.Namespace) -> int:
     """
     config, found = options.settings_of(args), list[checks.Finding]()
     camera, wanted = config.cameras, config.realtime
-    named: dict[str, V4l2Settings] = {name: camera.settings(name) for name in SIDES}
     images_hz = min(camera.rate_hz or USUAL_HZ, config.record.images_hz or math.inf)
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * images_hz
     for finding in chain(
-        checks.cameras(named, capture_devices(ROOT), ROOT),
+        checks.cameras({name: camera.settings(name) for name in SIDES}, capture_devices(ROOT), ROOT),
         checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.scan.floor_m),
         checks.motor(config.motor, ROOT),
         checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory),

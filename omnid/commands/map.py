@@ -76,8 +76,7 @@ def show(args: argparse.Namespace) -> int:
     examples:
       map show place.omap
     """
-    places, rig = read_places(args.map)
-    options.print_entries(_described(args.map, places, rig))
+    options.print_entries(_described(args.map, *read_places(args.map)))
     return 0
 
 

@@ -31,7 +31,6 @@ PERIOD_S: Final = 0.05  # Period of the commands.
 # a motion; then nothing, so that others may drive.
 HOLD_S: Final = 0.6
 FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
-HELP: Final = "arrows: drive  space: stop  a: arm  +/-: speed  q: quit"
 _SIDES: Final = {b"A": (0, 1), b"B": (0, -1), b"D": (1, 1), b"C": (1, -1)}  # axis of the stick, and its side
 # A terminal sends ESC [ A or, in its application mode, ESC O A.
 ARROWS: Final = {begin + letter: side for letter, side in _SIDES.items() for begin in (b"\x1b[", b"\x1bO")}
@@ -97,7 +96,7 @@ def teleoperate(bus: BusConfig) -> int:
     ):
         driver, stick = robot.driver(), Stick(limits_of(robot))
         driver.require_connected()
-        print(HELP)
+        print("arrows: drive  space: stop  a: arm  +/-: speed  q: quit")
         pressed_s = -math.inf  # keys that were typed while it connected still stop, arm and quit; motions are over
         try:
             status = ""
@@ -117,8 +116,8 @@ def teleoperate(bus: BusConfig) -> int:
                 velocity_mps, yaw_rate_radps = stick.twist(now_s)
                 if stick.commands(now_s):
                     driver.twist(velocity_mps, yaw_rate_radps)
-                share = f"{100 * stick.share:.0f} %"
-                HANDLER.show(f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s  {share}  {status}")
+                speeds = f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s"
+                HANDLER.show(f"{speeds}  {100 * stick.share:.0f} %  {status}")
         finally:
             driver.twist(0.0, 0.0)
             HANDLER.show("")

@@ -34,7 +34,8 @@ from omnid.transport.topics import MAP_POSE
 
 STATES: Final = tuple(TrackingState)
 UNKNOWN: Final = -1  # rank of a state that is not recorded
-GOOD, WARNING, ERROR = range(3)
+LEVELS: Final = ("", "warning", "error")
+GOOD, WARNING, ERROR = range(len(LEVELS))
 _COUNTERS: Final[Mapping[str, str]] = {  # of faults, with the text of the event when one rises
     Key.DROPS: "images dropped",
     Key.DROPPED: "messages dropped",

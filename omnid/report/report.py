@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator, Sequence
 from html import escape
 from itertools import pairwise
-from typing import Final
 
 import cv2
 import numpy as np
@@ -21,13 +20,11 @@ from omnid.plain_text import MOST_ENTRIES, plain, utc
 from omnid.recordings.evaluation import associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.page import Array, Curve, chart, colours, embedded, facts, grid, note, page, style_and_script, table
-from omnid.report.recorded_run import STATES, UNKNOWN, Event, RecordedRun
+from omnid.report.recorded_run import LEVELS, STATES, UNKNOWN, Event, RecordedRun
 from omnid.settings import changed, parse, value_at
 from omnid.transport import status_names
 from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, STAGE_PREFIX, WORK, Key, short_name, time_key
 from omnid.version import __version__
-
-LEVELS: Final = ("", "warning", "error")
 
 
 def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:

@@ -223,7 +223,7 @@ def serve(
                 "the page can be reached from the network without encryption: everyone who can listen there learns the "
                 "token, and may arm the robot; use a network that you trust, `ssh -L`, or a reverse proxy with TLS",
             )
-        # 4. Serve. uvicorn ends by a signal, and sends it once more to the handlers of before.
+        # 4. Serve. uvicorn ends at a signal, and raises it again for the handlers that were set before: they ignore it.
         with handle_stop_signals(lambda *_: None):
             asyncio.run(_run(uvicorn.Server(config), page.feed, listener))
 
@@ -286,8 +286,8 @@ def _listening(listen: str) -> Iterator[socket.socket]:
     """Yield a socket that listens on HOST:PORT. Raise OmnidError where that cannot be."""
     host, _, port = listen.rpartition(":")
     try:
-        family, _, _, _, address = socket.getaddrinfo(host.strip("[]") or None, int(port), type=socket.SOCK_STREAM)[0]
-        listener = socket.create_server(address[:2], family=family, backlog=socket.SOMAXCONN)
+        family, _, _, _, address = socket.getaddrinfo(host.strip("[]"), None, type=socket.SOCK_STREAM)[0]
+        listener = socket.create_server((address[0], int(port)), family=family, backlog=socket.SOMAXCONN)
     except (OSError, ValueError, OverflowError) as error:
         raise OmnidError(
             f"--listen {listen}: {error}; expected HOST:PORT with a free port, such as 127.0.0.1:8447, or 0.0.0.0:8447 "

@@ -56,7 +56,6 @@ TABLE = (
     ("record --rig {rig} --lower /dev/no-camera --upper /dev/null", "/dev/no-camera"),
     ("goto 1", "expected X Y [YAW]"),
     ("route teach a/b", "a/b"),
-    ("web --tls-key {rig}", "belong together"),
 )
 
 

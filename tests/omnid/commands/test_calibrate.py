@@ -180,7 +180,6 @@ def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
     words = ("calibrate", "live", kept, *OPTIONS, "--set", f'bus.listen=["{free_endpoint()}"]')
     first = omnid(*words)
     assert first.code == 1 and f"{LIVE_PAIRS} pairs, not enough yet: {15 - LIVE_PAIRS} more positions" in first.err
-    assert first.out.splitlines()[0].startswith("1: 14 more positions; both cameras: ")
     assert sorted(path.name for path in kept.iterdir())[::LIVE_PAIRS] == ["lower_001.png", "upper_001.png"]
     np.testing.assert_array_equal(image(kept, "upper_002"), image(larger, "upper_01"))
     again = omnid(*words)
@@ -262,7 +261,7 @@ def kalibr(tmp_path: Path) -> Path:
 def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert import_rig(kalibr, "-o", tmp_path / "rig.toml") == 0
     (line,) = capsys.readouterr().out.splitlines()
-    assert "lower omni 768x770, upper omni 768x770" in line
+    assert "lower omni, upper omni, " in line
     assert "baseline 201.2 mm, upper rotated by 17.4" in line and "no height of the cameras (--height-m" in line
     assert import_rig(kalibr, "--lower", "cam1", "-o", tmp_path / "swapped.toml", "--height-m", 0.8) == 0
     swapped = read_rig(tmp_path / "swapped.toml")
@@ -285,7 +284,7 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     files.append("--replace")
     assert import_rig(*files) == 2 and "--transform FILE or --baseline METRES" in capsys.readouterr().err
     assert import_rig(*files, "--baseline", 0.2, "--view", "direct") == 0
-    assert "upper ocam, direct view 640x480" in (line := capsys.readouterr().out)
+    assert "upper ocam, direct view, " in (line := capsys.readouterr().out)
     assert "baseline 200.0 mm, upper rotated by 0.00 deg" in line
 
 
