@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import select
 import signal
 import subprocess
 import sys
@@ -64,12 +65,13 @@ def publish(bus: Bus, number: int) -> None:
 def publish_until_it_ends(
     bus: Bus, process: subprocess.Popen[str], number_of_signal: signal.Signals
 ) -> tuple[str, str]:
-    """Publish, and send the signal after 150 messages."""
-    deadline_s = time.monotonic() + DEADLINE_S
+    """Publish, and send the signal after the first line and 150 further messages."""
+    deadline_s, further = time.monotonic() + DEADLINE_S, 0
     for number in count():
         publish(bus, number)
         time.sleep(0.01)
-        if number == 150:
+        further += bool(further or select.select([process.stdout], [], [], 0)[0])
+        if further == 150:
             process.send_signal(number_of_signal)
         if process.poll() is not None:
             break
