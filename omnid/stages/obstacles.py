@@ -145,7 +145,7 @@ class Obstacles:
             self.scans.begin_again()
             self._resets = odometry.reset_counter
         if is_again or is_lost:
-            self._tracker.clear()
+            self._tracker = MovingTracker()
         panoramas, self.scans.belief = odometry.depth.panoramas, None
         T_odom_base = frames.of_base(odometry, self._geometry.rig.T_base_rig)[0]
         tiles, of_base = panoramas.tiles, (self._geometry.cylinder, self._T_base_rect)

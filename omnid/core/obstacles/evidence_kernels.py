@@ -18,7 +18,7 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Numbers = NDArray[np.int32]
 
-LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
+LARGEST = np.uint16(np.iinfo(np.uint16).max)
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
 UNITS = 12.0  # levels of a normalised image in one sigma, because 8 bits hold ten sigmas either way
 OUTLIER = np.uint8(4 * UNITS)  # Most units by which a pixel differs, because more than four sigmas are no noise.

@@ -29,7 +29,7 @@ from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.moving_tracker import Arrivals, runs
-from omnid.core.obstacles.plane_view import AZIMUTHS, THIN_M
+from omnid.core.obstacles.plane_view import AZIMUTHS
 from omnid.core.obstacles.posterior import RISK, RayBelief
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ class GridParameters:
     shown_weight: float = 100.0  # and its log-odds by this mean
 
 
-CELL_M: Final = 0.05
+CELL_M: Final = kernels.CELL_M
 REACH_CELLS: Final = 90  # of the grid, on either side of the cell of the base
 SIDE: Final = 2 * REACH_CELLS + 1
 STEPS_M: Final = CELL_M * (np.arange(REACH_CELLS) + 0.5)  # ranges of cells along a ray
@@ -181,9 +181,9 @@ class ObstacleGrid:
         found, states = np.empty((3, SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.uint8)
         hides = self._hides(belief)
         near = np.where(belief.view[:, 0] > 0, np.where(hides, 2, 1), 0).astype(np.uint8)
-        of_belief = belief.ratios, belief.view, belief.surface, near, belief.ends_m, self._at_1m
+        of_belief = belief.ratios, belief.view, belief.surface, near, belief.ends_m
         reach_m = min(float(belief.ends_m[-2]), self._max_range_m)
-        kernels.gather(*of_belief, self._ranges_m, columns, CELL_M, reach_m, THIN_M, found, states)
+        kernels.gather(*of_belief, self._ranges_m, columns, reach_m, found, states)
         in_view, past, hidden = (states == one for one in (kernels.IN_VIEW, kernels.SEEN_PAST, kernels.HIDDEN))
         observed = in_view & (found[kernels.VIEW] > 0.5)
         # 2. What is new of it.

@@ -96,10 +96,6 @@ class MovingTracker:
         self._tracks: list[Track] = []
         self._stamp_ns = 0
 
-    def clear(self) -> None:
-        """Forget everything: odom has lost its relation to the past."""
-        self._tracks.clear()
-
     def update(self, stamp_ns: int, T_odom_eye: Array, arrivals: Arrivals) -> tuple[MovingObstacle, ...]:
         """Return the moving obstacles after a pair, by what has come onto free floor about the viewpoint.
 

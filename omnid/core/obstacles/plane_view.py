@@ -25,7 +25,7 @@ from calib.panorama import Cylinder
 from drivers.jpeg import coding_sigma
 from omnid.core.obstacles import evidence_kernels as kernels
 from omnid.core.obstacles.evidence_kernels import UNITS
-from omnid.core.obstacles.ray_kernels import PARAMETERS
+from omnid.core.obstacles.ray_kernels import PARAMETERS, THIN_M
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -54,7 +54,6 @@ CODING_FREQUENCIES: Final = 3.0
 BOUNDED_SIGMAS: Final = 5.5
 
 NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
-THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
 # Rows on either side of those in which the floor has a disparity. Measured: with 1, 2 and 3 of them 10.5, 11.1 and 11.8
 # % of the directions of things are called free beyond these, and 93.7, 94.9 and 95.8 % of open ones up to 1.5 m.
 BIN_ROWS: Final = 2

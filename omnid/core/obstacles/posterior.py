@@ -30,6 +30,7 @@ from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.plane_view import AZIMUTHS, BINS_PER_PX, DIRECTIONS, Bins, ShownBins, pooled, turned
 from omnid.core.obstacles.ray_kernels import PARAMETERS as P
+from omnid.core.stereo.tiles import SATURATED_GREY
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -42,7 +43,6 @@ TYPICAL_M: Final = 1.3  # range at which the near floor is seen
 SIDE: Final = 3  # directions on either side with which a bin is compared
 LEAST: Final = 1e-30  # density, so that logarithms are finite
 BESIDE: Final = range(5, 13)  # directions on either side of something thin: as wide as a thing of 10 cm at 1 m
-SATURATED: Final = 250.0  # grey from which a pixel shows nothing
 ALONG_RAD: Final = math.radians(35.0)  # about ahead and behind: floor there is assumed before any is known
 
 
@@ -114,7 +114,7 @@ def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -
     look = _look(shown.steps, greys, near & (ranges_m < 1.6), np.maximum(ranges_m / TYPICAL_M, 1.0).astype(np.float32))
     far = (shown.far / max(float(sigmas[-1, 0]), float(sigmas.min()))).astype(np.float32)
     # 4. The posterior.
-    seen = shown.seen & (greys < SATURATED)
+    seen = shown.seen & (greys < SATURATED_GREY)
     terms = np.where(seen, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
     terms[kernels.FITS] = fits
     lengths_m = np.diff(bins.ends_m).astype(np.float32)
