@@ -66,9 +66,6 @@ LEVEL_STEP_PX: Final = 0.375  # between planes below the floor, because matching
 LEVEL_STEPS: Final = 3  # planes on either side, twice as far apart: enough to where others are compared
 # Share of the least height and fall by which a floor is uneven, so that two more planes are floor.
 EVEN_SHARE: Final = 0.33
-# An object often hides the floor near itself: decay of the prior with the disparity, and the share of it that is left
-# far away. Measured: two thirds to 1.5 times as much are alike.
-ADJACENT_PX, DISTANT_SHARE = 4.0, 0.1
 HALF_ROWS: Final = 4  # of half a strip of a surface; the other half is the first one of the next strip
 LEAST_OTHERS: Final = 1e-4  # bound of the mean likelihood of other explanations
 BINS_PER_PX: Final = 2
@@ -184,9 +181,6 @@ class PlaneView:
         self._sums = np.empty((self.disparities, self.height + 1, DIRECTIONS), np.uint16)
         self._patches, self._offsets = self._made_patches()
         self._strips = self._made_strips(first_row)
-        self._prior: Floats = np.exp(-np.arange(self.disparities) / ADJACENT_PX).astype(np.float32) + np.float32(
-            DISTANT_SHARE
-        )
         # 3. Bins, and the rows of both views that show them.
         if bins is None:
             numbers = np.arange(BINS_PER_PX * self.disparities)
@@ -245,7 +239,7 @@ class PlaneView:
         others, levels = np.empty_like(surface), np.empty((2, *surface.shape), np.float32)
         lower, upper = pair.normalised(BOUNDED_SIGMAS)
         plane_sums, rows = self._sum_differences(lower, upper, live), self.plane_rows
-        tables = self._patches, self._offsets, self._prior
+        tables = self._patches, self._offsets
         kernels.floor_evidence(lower, upper, live, self._sums, plane_sums, rows, *tables, others, levels)
         together = self._patches[:, kernels.PATCH_THIN, None].astype(np.float32)
         floor = -together * np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
