@@ -120,19 +120,18 @@ def lower_to(values: Words, into: Words) -> None:
         into[u] = values[u] if values[u] < into[u] else into[u]
 
 
-@compiled("(u1[:, ::1], u1[:, :, ::1], u1[:, ::1], u2[:, :, ::1])", writes=("sums",))
-def sum_differences(lower: Bytes, bounds: Bytes, live: Bytes, sums: Words) -> None:
-    """Write the sums (D, H + 1, W), modulo 2^16, of the differences at D disparities in all rows above a row.
+@compiled("(u1[:, ::1], u1[:, :, ::1], u1[:, ::1], i8, u2[:, :, ::1])", writes=("sums",))
+def sum_differences(lower: Bytes, bounds: Bytes, live: Bytes, first: int, sums: Words) -> None:
+    """Write the sums (D, H + 1, W), modulo 2^16, of the differences at D disparities from a first row to each row.
 
     lower (H, W): normalised panorama; bounds (2, H, W): least and most of the upper one about each pixel; live (H, W):
-    255 where pixels may be compared, else 0. Rows without another one at a disparity add nothing.
+    255 where pixels may be compared, else 0.
     """
     height = len(lower)
     for d in range(len(sums)):
-        sums[d, 0] = NOTHING
-        for v in range(height):
-            if v + d < height:
-                add_differences(lower[v], bounds[0, v + d], bounds[1, v + d], live[v], sums[d, v], sums[d, v + 1])
+        sums[d, first] = NOTHING
+        for v in range(first, height - d):
+            add_differences(lower[v], bounds[0, v + d], bounds[1, v + d], live[v], sums[d, v], sums[d, v + 1])
 
 
 @compiled(

@@ -224,7 +224,7 @@ class PlaneView:
         # 2. Surfaces. They fit a little at the next disparities, too.
         live = pair.seen * np.uint8(255)
         surface = np.empty((self.disparities, DIRECTIONS), np.float32)
-        plane_sums = self._sum_differences(*pair.normalised(), live)
+        plane_sums = self._sum_differences(*pair.normalised(), live, 0)
         kernels.surface_evidence(self._sums, plane_sums, self._strips, surface)
         nearer, farther = (np.roll(surface, shift, axis=0) for shift in (-1, 1))
         surface = np.where((surface >= nearer) & (surface >= farther), surface, np.float32(0))
@@ -238,7 +238,7 @@ class PlaneView:
         # 4. The floor, and planes beside it.
         others, levels = np.empty_like(surface), np.empty((2, *surface.shape), np.float32)
         lower, upper = pair.normalised(BOUNDED_SIGMAS)
-        plane_sums, rows = self._sum_differences(lower, upper, live), self.plane_rows
+        plane_sums, rows = self._sum_differences(lower, upper, live, max(int(self.row0) - BIN_ROWS, 0)), self.plane_rows
         tables = self._patches, self._offsets
         kernels.floor_evidence(lower, upper, live, self._sums, plane_sums, rows, *tables, others, levels)
         together = self._patches[:, kernels.PATCH_THIN, None].astype(np.float32)
@@ -270,12 +270,12 @@ class PlaneView:
         sized = self._sized(flags * np.uint8(255))
         return sized if self._level_map is None else np.asarray(cv2.remap(sized, *self._level_map, cv2.INTER_LINEAR))
 
-    def _sum_differences(self, lower: Bytes, upper: Bytes, live: Bytes) -> NDArray[np.uint16]:
+    def _sum_differences(self, lower: Bytes, upper: Bytes, live: Bytes, first: int) -> NDArray[np.uint16]:
         """Keep the sums of kernels.sum_differences of normalised panoramas at all disparities; return those on the
         plane (H + 1, DIRECTIONS)."""
         on_plane = np.empty((1, *self._sums.shape[1:]), np.uint16)
-        kernels.sum_differences(lower, _half_row_bounds(upper), live, self._sums)
-        kernels.sum_differences(lower, _half_row_bounds(_remapped(upper, self._plane_map)), live, on_plane)
+        kernels.sum_differences(lower, _half_row_bounds(upper), live, first, self._sums)
+        kernels.sum_differences(lower, _half_row_bounds(_remapped(upper, self._plane_map)), live, first, on_plane)
         return np.asarray(on_plane[0])
 
     def _made_patches(self) -> tuple[Tables, Floats]:
