@@ -56,7 +56,7 @@ class Wall(Struct, frozen=True):
     """A wall along a polyline; doors are in the first part of it."""
 
     points: Path
-    texture: Texture | Literal["random"] = "random"
+    texture: Literal[Texture, "random"] = "random"
     height_m: Side | None = None  # None: up to the ceiling
     posters_per_m: Annotated[float, Meta(ge=0.0, le=4.0)] = 0.0
     poster_sides: Literal["front", "both"] = "front"
@@ -70,7 +70,7 @@ class Box(Struct, frozen=True):
     size_m: Size
     bottom_m: Distance = 0.0  # over the floor
     yaw_deg: float = 0.0
-    texture: Texture | Literal["poster"] = "poster"
+    texture: Literal[Texture, "poster"] = "poster"
 
 
 class Walker(Struct, frozen=True):
