@@ -24,9 +24,7 @@ from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.stereo.photometry import Light
-from omnid.core.stereo.tiles import ALL_LIVE, TileStates
-from omnid.core.types.panorama import PaddedPanorama
-from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
+from omnid.core.types.panorama import Panoramas
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -44,27 +42,6 @@ class FramePair:
     skew_s: float = 0.0  # upper minus lower exposure
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     jpeg_steps: tuple[Steps, Steps] = ((), ())  # of the quantisation of both JPEGs (drivers.jpeg), (): none
-
-
-@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
-class Panoramas:
-    """Both images on the cylinder about the line through the viewpoints: epipolar lines are columns."""
-
-    seq: int
-    stamp_ns: int
-    lower: PaddedPanorama
-    upper: PaddedPanorama
-    visible: NDArray[np.bool_]  # (H, W) both cameras show the world here and in a tracking window around
-    times: PixelTimes = AT_ONCE
-    light: Light = field(default_factory=Light)
-    motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
-    tiles: TileStates = ALL_LIVE  # the parts of the images that are dead or blind
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        """Pixels (H, W) that show the world in live parts of both images."""
-        lost = self.tiles.lost_pixels(self.visible.shape)
-        return self.visible if lost is None else self.visible & ~lost
 
 
 @dataclass(frozen=True, slots=True, eq=False)

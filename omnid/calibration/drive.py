@@ -33,7 +33,7 @@ from omnid.calibration.drive_observations import Drives, collect, observe_pairs
 from omnid.calibration.images import SIDES
 from omnid.calibration.rig_check import MAX_SKEW_S, check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
-from omnid.core.rig.column_finding import SIGMAS
+from omnid.core.rig.rig_health import SIGMAS
 from omnid.core.stereo.triangulation import common_perpendicular
 from omnid.errors import OmnidError
 

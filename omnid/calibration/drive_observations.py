@@ -17,9 +17,8 @@ from calib.rig import Rig
 from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.config import Config
-from omnid.core.rig.column_finding import RigState, match
-from omnid.core.rig.drive_landmarks import DriveLandmarks, View, in_images
-from omnid.core.rig.rig_health import RigHealth
+from omnid.core.rig.drive_landmarks import DriveLandmarks, in_images
+from omnid.core.rig.rig_health import RigHealth, RigState, match
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate
@@ -120,7 +119,7 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
             since = 0
             # 2. Follow the landmarks to this keyframe.
             seen, disparity = update.depth.panoramas, front_end.dense.of(update.depth).disparity
-            landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_odom_rig @ place.T_rig_rect))
+            landmarks.add(seen, disparity, T_odom_rig @ place.T_rig_rect)
             T_rig_odom.append(se3.inverse(T_odom_rig))
             # 3. Its motion, which predicts the views at other times of exposure.
             twists.append(update.velocity)

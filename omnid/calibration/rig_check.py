@@ -16,14 +16,13 @@ from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import TOLERANCE_NS, spread_pairs
 from omnid.config import Config, PanoramaConfig
-from omnid.core.rig.column_finding import (
+from omnid.core.rig.rig_health import (
     DRIFTED_PX,
     MIN_MATCHES,
     RigFinding,
     RigState,
     judge,
     match,
-    together,
 )
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
@@ -62,7 +61,6 @@ class RigCheckResult:
         finding = self.finding
         lines = [
             f"{finding.state}: {self.pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
-            f"columns: median {finding.offset_px:+.3f} px",
         ]
         if (drift := finding.drift) is not None:
             turn, turn_sigma = np.rad2deg(drift.turn), np.rad2deg(drift.turn_sigma)
@@ -144,7 +142,7 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
     seen = map(dewarp.process, pairs)
     found = [match(panoramas.lower, panoramas.upper, panoramas.visible) for panoramas in seen]
     skew_s = float(np.median([pair.skew_s for pair in pairs]))
-    return RigCheckResult(judge(together(found), rectification.cylinder), len(pairs), skew_s)
+    return RigCheckResult(judge(found, rectification.cylinder), len(pairs), skew_s)
 
 
 def with_masks(log: Path, rig: Rig, cameras: LogCameras) -> Rig:

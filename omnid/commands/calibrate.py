@@ -30,7 +30,7 @@ from omnid.calibration.live_boards import LiveBoards, newest_pairs, status
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.rig_check import check_log, with_upper_corrected
 from omnid.commands import options
-from omnid.core.rig.column_finding import RigState
+from omnid.core.rig.rig_health import RigState
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError

@@ -16,8 +16,7 @@ from omnid.core.control.arming import STARTED
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.core.rig.column_finding import RigState
-from omnid.core.rig.rig_health import VIEWS, RigHealth
+from omnid.core.rig.rig_health import VIEWS, RigHealth, RigState
 from omnid.core.stereo.tiles import SIDES
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
@@ -179,7 +178,7 @@ def stage_stats(stage: StageStats, rate_hz: float = math.nan) -> Stats:
 
 def rig_stats(health: RigHealth) -> Stats:
     """Return the state of the rig, and the evidence of the newest finding."""
-    stats = {Key.STATE: health.state, "new_views": health.new_views, "needed_views": VIEWS}
+    stats = {Key.STATE: health.state, "views": len(health.views), "needed_views": VIEWS}
     if warning := health.warning:
         stats["_error" if health.state.is_contradicted else "_warning"] = warning
     elif health.state is RigState.FITS:
@@ -187,7 +186,7 @@ def rig_stats(health: RigHealth) -> Stats:
     else:
         stats["_words"] = "not checked yet: the robot must drive past different places"
     if (found := health.finding) is not None:
-        stats |= {name: getattr(found, name) for name in ("turn_deg", "offset_px", "left_px", "matches", "tried")}
+        stats |= {name: getattr(found, name) for name in ("turn_deg", "left_px", "matches", "tried")}
     return stats
 
 

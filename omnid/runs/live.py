@@ -209,10 +209,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         outputs = replace(outputs, recorder=recorder)
     if config.bus.panorama_hz:
         outputs.poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns)
-    if health.uses_views:
-        outputs.poses["rig"] = lambda pose: health.drive(
-            pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure
-        )
+    outputs.poses["rig"] = lambda pose: health.drive(pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure)
 
     # 3. The stages. Samples of gyro and wheels come from the bus, unless they come with the images of a log or of a
     #    simulation, whose motion others would not fit; a motor controller gives those of its wheels.

@@ -18,10 +18,10 @@ from omnid.core.odometry.earlier_view import EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.stereo.matcher import Matcher
 from omnid.core.stereo.triangulation import triangulate
-from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama, Panoramas
 from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
-from omnid.messages import DensePoints, Panoramas, StereoDepth
+from omnid.messages import DensePoints, StereoDepth
 from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]

@@ -16,10 +16,10 @@ from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.odometry.line_times import RawImage
 from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
 from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
-from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama, Panoramas
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.errors import OmnidError
-from omnid.messages import FramePair, Panoramas
+from omnid.messages import FramePair
 from omnid.stages.geometry import Geometry
 
 NOISE_NS = NS_PER_S  # Time between two measurements of the noise, because exposure changes it slowly.

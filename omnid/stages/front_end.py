@@ -23,7 +23,8 @@ from omnid.core.odometry.rig_error import RigError
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.recognition import Relocaliser
 from omnid.core.rig.rig_health import RigHealth
-from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
+from omnid.core.types.panorama import Panoramas
+from omnid.messages import FramePair, OdometryUpdate, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
@@ -55,7 +56,6 @@ class FrontEnd:
         self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
         self._last_ns: int | None = None
         self._unchecked: StereoDepth | None = None  # the last pair, if it is to be checked with its motion
-        self._was_found = False  # whether a pose was tracked yet
         self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, if its pose was known well
         self.motion = MotionFilter(T_base_rect=self._T_base_rect)
         self._method: VisualOdometry | PaperOdometry
@@ -127,9 +127,6 @@ class FrontEnd:
         update = self._update(pair, estimate, state)
         # 6. Whether the next pair is to be checked.
         self._unchecked = update.depth if is_checking and not pair.times.is_at_once else None
-        self._was_found |= estimate.state is TrackingState.TRACKING
-        if self._was_found and state is TrackingState.LOST:
-            self.health.check_again()
         return update
 
     def complete(self) -> None:

@@ -38,7 +38,7 @@ from calib.rig_file import read_rig
 from omnid.calibration.images import BY_NAME
 from omnid.calibration.rig_check import check_log
 from omnid.cli import main as omnid_main
-from omnid.core.rig.column_finding import RigState
+from omnid.core.rig.rig_health import RigState
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor

@@ -1,7 +1,4 @@
-"""Is the rig right? Evidence by the columns of its panoramas, and one state machine.
+"""Is the rig right? `rig_health.py`: matches between both panoramas say so at the start of a run and while it drives.
 
-Begin with `rig_health.py`: a point of the world lies in one column of both panoramas; matches between them say whether
-the cameras are exchanged, turned or shifted against the calibration, at the start of a run and while it drives.
-`column_finding.py` estimates the rotation between the cameras from such matches, `drive_landmarks.py` follows landmarks
-over a drive for `omnid calibrate drive`.
+`drive_landmarks.py` follows landmarks over a drive, for `omnid calibrate drive`.
 """

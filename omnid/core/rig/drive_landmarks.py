@@ -7,7 +7,7 @@ which is some tenths of a per cent of the scale.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,7 +20,7 @@ from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
 from omnid.core.odometry.local_map import Keyframe, LocalMap
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.panorama import Panoramas
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -42,17 +42,6 @@ REACH_PX: Final = 2
 TRACK_UPPER: Final = KltSettings(levels=1)
 
 
-@dataclass(frozen=True, slots=True)
-class View:
-    """One instant of a drive: both panoramas, where both show the world, disparity of the lower one, and the pose."""
-
-    lower: PaddedPanorama
-    upper: PaddedPanorama
-    visible: Flags  # (H, W)
-    disparity: NDArray[np.float32]  # (H, W) px
-    T_odom_rect: Array  # (4, 4)
-
-
 class DriveLandmarks:
     """Tracks landmarks from keyframe to keyframe; keeps the images of the newest MAX_KEYFRAMES keyframes only."""
 
@@ -65,12 +54,15 @@ class DriveLandmarks:
         # Observations of each call: keyframe, landmark, camera, pixels.
         self._found: list[tuple[Indices, Indices, Indices, Array]] = []
 
-    def add(self, view: View) -> None:
-        """Take a keyframe: find the landmarks of the one before in it, and add new ones between them."""
+    def add(self, pair: Panoramas, disparity: NDArray[np.float32], T_odom_rect: Array) -> None:
+        """Take a keyframe: find the landmarks of the one before in it, and add new ones between them.
+
+        disparity (H, W) [px] of the lower panorama; T_odom_rect (4, 4): its pose.
+        """
         self._number += 1
         if self._number:
-            self._follow(view)
-        self._start_landmarks(view)
+            self._follow(pair, T_odom_rect)
+        self._start_landmarks(pair, disparity, T_odom_rect)
 
     def observations(self) -> tuple[DriveObservations, Array]:
         """Return all observations, in the panoramas, of landmarks that MIN_KEYFRAMES have seen, numbered from 0.
@@ -84,43 +76,43 @@ class DriveLandmarks:
         pixels = np.concatenate([part[3] for part in self._found])
         return DriveObservations(keyframe[kept], numbers, camera[kept], pixels[kept]), self._points[used]
 
-    def _follow(self, current: View) -> None:
+    def _follow(self, current: Panoramas, T_odom_rect: Array) -> None:
         """Find the landmarks of the newest keyframe in the next one, in both of its panoramas."""
         # 1. Predict by the pose, track in the lower panorama, and align the first keyframe's patches, so that the error
         #    does not grow from keyframe to keyframe.
-        tracks = self._map.track(current.lower, current.T_odom_rect)
-        pixels, fits = self._aligned(current, tracks.landmarks, tracks.pixels, upper=False)
+        tracks = self._map.track(current.lower, T_odom_rect)
+        pixels, fits = self._aligned(current, T_odom_rect, tracks.landmarks, tracks.pixels, upper=False)
         fits &= _is_set(current.visible, pixels)
         rows, pixels, predicted = tracks.landmarks[fits], pixels[fits], tracks.predicted[fits]
         self._observe(rows, 0, pixels)
         # 2. The same in the upper panorama.
         guess = np.column_stack([pixels[:, 0], pixels[:, 1] + predicted[:, 2] - predicted[:, 1]])
         above, found = track(current.lower, current.upper, pixels, guess, TRACK_UPPER)
-        in_upper, fits = self._aligned(current, rows[found], above[found], upper=True)
+        in_upper, fits = self._aligned(current, T_odom_rect, rows[found], above[found], upper=True)
         self._observe(rows[found][fits], 1, in_upper[fits])
         self._map.update_tracked(current.lower, rows, pixels)
 
-    def _start_landmarks(self, current: View) -> None:
+    def _start_landmarks(self, current: Panoramas, disparity: NDArray[np.float32], T_odom_rect: Array) -> None:
         """Begin new landmarks in the gaps, where both panoramas show the same patch."""
         # 1. Corners in the gaps, with the disparity of the pixels around them.
         known_pixels, pair = self._map.table.pixels, (current.lower, current.upper)
         free = clear_around(current.visible, known_pixels)
         pixels = corners(current.lower, free, LANDMARKS - len(known_pixels))
-        disparity = nearby_disparity(current.disparity, pixels)
-        pixels, disparity = pixels[np.isfinite(disparity)], disparity[np.isfinite(disparity)]
+        nearby = nearby_disparity(disparity, pixels)
+        pixels, nearby = pixels[np.isfinite(nearby)], nearby[np.isfinite(nearby)]
         # 2. Track them into the upper panorama.
-        above, found = track(*pair, pixels, pixels + np.outer(disparity, [0.0, 1.0]), TRACK_UPPER)
+        above, found = track(*pair, pixels, pixels + np.outer(nearby, [0.0, 1.0]), TRACK_UPPER)
         found &= above[:, 1] > pixels[:, 1] + 0.5
         pixels, above = pixels[found], above[found]
         # 3. Surfaces and points, by the rig as it is.
-        slopes = disparity_slopes(current.disparity, pixels, above[:, 1] - pixels[:, 1])
+        slopes = disparity_slopes(disparity, pixels, above[:, 1] - pixels[:, 1])
         slopes = fitted_slopes(pair, pixels, above, slopes, self._model)
-        keyframe = Keyframe(self._number, current.lower, current.T_odom_rect, np.zeros((6, 6)))
+        keyframe = Keyframe(self._number, current.lower, T_odom_rect, np.zeros((6, 6)))
         ids = self._map.add_keyframe(keyframe, np.column_stack([pixels, above[:, 1]]), slopes)
         rows, known = self._map.rows(ids)
         self._points = np.concatenate([self._points, self._map.table.points[rows]])
         # 4. Keep those whose patch fits in the upper panorama as well.
-        in_upper, fits = self._aligned(current, rows, above[known], upper=True)
+        in_upper, fits = self._aligned(current, T_odom_rect, rows, above[known], upper=True)
         self._observe(rows[fits], 0, pixels[known][fits])
         self._observe(rows[fits], 1, in_upper[fits])
         self._map.keep(np.delete(self._map.table.id, rows[~fits]))
@@ -130,10 +122,12 @@ class DriveLandmarks:
         count = len(rows)
         self._found.append((np.full(count, self._number), self._map.table.id[rows], np.full(count, camera), pixels))
 
-    def _aligned(self, current: View, rows: Indices, near: Array, *, upper: bool) -> tuple[Array, Flags]:
+    def _aligned(
+        self, current: Panoramas, T_odom_rect: Array, rows: Indices, near: Array, *, upper: bool
+    ) -> tuple[Array, Flags]:
         """Return pixels (M, 2) of landmarks near those given, by their first keyframes' patches, and which fit."""
         image = current.upper if upper else current.lower
-        aligned = self._map.align(image, current.T_odom_rect, rows, near, REACH_PX, upper=upper)
+        aligned = self._map.align(image, T_odom_rect, rows, near, REACH_PX, upper=upper)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
         return np.column_stack([current.lower.own(pixels[:, 0]), pixels[:, 1]]), aligned.found
 

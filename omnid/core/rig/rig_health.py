@@ -1,178 +1,321 @@
-"""State of the rig of a run: one filter of matches between both panoramas, of first pairs and of views of the drive.
+"""State of a rig by matches between both panoramas of some pairs: of the start of a run, of its drive, or of a log.
 
-The stage that computes depth shows it the first pairs (`begin`), before a pose moves wheels; a sink shows it views of a
-live run (`drive`), which overrule the first pairs unless the cameras are exchanged. Each of the two threads sets its
-finding in one assignment, and any thread may read the state.
+A point that both cameras see lies on the same column of both panoramas, and lower in the upper one. With the cameras
+exchanged it lies higher, so the matches downwards from the lower panorama are then fewer than those downwards from the
+upper one. A rotation of a camera, or another mirror, moves the columns. In rendered rooms, corridors and bare walls, a
+right rig gives 0.00 to 0.41 matches with the cameras exchanged for each match, exchanged ones give 2.0 or more, and one
+that is turned by 3 deg is measured within 0.3 deg (four standard deviations subtracted).
+
+A mirror whose scale alone is larger than the rig's moves points along the columns only, which a wrong distance explains
+as well: that cannot be seen here.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import islice
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.panorama import Cylinder
+from calib.fit.rig_drift import RigDrift, estimate_rig_drift
+from calib.panorama import Cylinder, at_scale
+from omnid.core.odometry.corners import corners
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.rig.column_finding import (
-    BROKEN_DEG,
-    MIN_MATCHES,
-    Matches,
-    PanoramaPair,
-    RigFinding,
-    RigState,
-    is_motion_unknown,
-    judge,
-    match,
-    together,
-)
+from omnid.core.odometry.tracking import KltSettings, track
+from omnid.core.stereo.semiglobal import MIN_DISPARITY_PX
+from omnid.core.types.panorama import PaddedPanorama, Panoramas
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Image = NDArray[np.uint8]
 
-# Views that are kept, and new views after which the rig is checked again, because at the default period they take 80 s
-# of driving. So many of the first pairs are a round where matches are few, and so many pairs may pass before pairs are
-# used whose motion is not known: with a rig that is wrong by degrees, no odometry starts that could find the motion.
+# Corners per pair: two pairs have MIN_MATCHES if four corners in ten are found.
+POINTS: Final = 160
+# The coarse search works on images reduced by this factor, because its cost falls with the fourth power, and the
+# tracker that follows converges from two reduced pixels away.
+COARSE: Final = 4
+# Half the side of a patch, in the reduced image: 36 px of the panorama, some ten degrees at 1300 columns. At all
+# scales, because fewer pixels match by chance.
+PATCH_PX: Final = 4
+# Search range to either side and downwards, in the reduced image at scale 1: five degrees of 1300 columns, because a
+# rig that is wrong by more finds chance matches only; and a point at one and a half baselines.
+ASIDE_PX, DOWN_PX = 5, 30
+# Least correlation of a coarse match, because the search is wide, and a lower one lets more chance matches pass.
+MIN_CORRELATION: Final = 0.8
+# Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than the coarse search errs.
+KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
+# Standard deviation of a coarse patch with contrast, grey levels, because noise alone, averaged over COARSE^2 pixels,
+# has less.
+CONTRAST_GREY: Final = 6.0
+
+# Matches for a finding: ten in each sector of azimuth, so that a tilt and a shift can be distinguished.
+MIN_MATCHES: Final = 120
+# Rotation of the upper camera from which a rig has drifted: calibrated rigs, rendered and real, show less than 0.1 deg.
+# From the other one it is broken: two degrees are seven columns of a panorama of 1300, so that stereo, which searches
+# one column, matches by chance.
+DRIFTED_DEG, BROKEN_DEG = 0.2, 2.0
+# Weight of the shift's angle against the rotation's, because a shifted viewpoint affects near points only.
+SHIFT_WEIGHT: Final = 0.2
+# Standard deviations subtracted from rotation and shift, so that an uncertain finding accuses no rig.
+SIGMAS: Final = 4.0
+# Least part of the points with contrast that match: with a rig that is wrong by many degrees they match by chance only.
+# Corners without contrast are noise, which matches with no rig.
+MIN_MATCHED_PART: Final = 0.08
+# Median residual of the sectors of azimuth, each about as wide as a wall in a room, from which a rig has drifted:
+# changed intrinsics bend the columns all around, while wrong matches on one wall change one sector.
+SECTORS, DRIFTED_PX = 12, 0.3
+
+# Views of a drive that are kept, some 80 s of driving at the default period. So many of the first pairs are a round
+# where matches are few, and so many pass before pairs are used whose motion is not known: with a rig that is wrong by
+# degrees, no odometry starts that could find the motion.
 VIEWS: Final = 16
-# Between two rounds while the images show too little, because light changes slower than that.
-RETRY_NS: Final = 1_000_000_000
-VIEW_M: Final = 0.3  # between two views, because one place shows the same points again
-# Newest views that show alone that the rig is broken, because a mirror was knocked, and the wheels must not wait for
-# VIEWS.
+# Newest views that show alone that the rig is broken, because a mirror was knocked, and the wheels must not wait.
 RECENT_VIEWS: Final = 3
+VIEW_M: Final = 0.3  # between two views, because one place shows the same points again
 
-CALIBRATE: Final = (
-    "give the rig of these cameras, or calibrate it: `omnid calibrate drive --only check` shows by how much it is off"
-)
+
+class RigState(StrEnum):
+    """State of a rig by the images; ARCHITECTURE.md has a figure of the transitions."""
+
+    UNCHECKED = "unchecked"  # The images show too little, or nothing was checked yet.
+    FITS = "fits"
+    DRIFTED = "drifted"  # The rig is off by some tenths of a degree: poses are less accurate.
+    EXCHANGED = "exchanged"  # The lower and the upper camera are exchanged.
+    BROKEN = "broken"  # The rig is off by degrees: a mirror was knocked, a camera covered, or it is of other cameras.
+
+    @property
+    def is_contradicted(self) -> bool:
+        """True if the images cannot be of this rig, so that their poses are not reliable."""
+        return self in (RigState.EXCHANGED, RigState.BROKEN)
 
 
 class RigContradictedError(OmnidError):
     """The images cannot be of this rig."""
 
 
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Points of the lower panorama found in the upper one: (column, row) (N, 2) each.
+
+    tried: number of points searched; clear: number of these with contrast.
+    """
+
+    lower: Array
+    upper: Array
+    tried: int
+    clear: int
+
+
+@dataclass(frozen=True, slots=True)
+class RigFinding:
+    """The rig by the matches of some pairs."""
+
+    state: RigState
+    matches: int
+    tried: int  # points that were searched
+    drift: RigDrift | None  # of the upper camera; None: there are fewer than MIN_MATCHES
+    misfit_deg: float  # rotation, or part of the shift, less SIGMAS standard deviations; 0 where it is unknown
+    left_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
+
+    @property
+    def turn_deg(self) -> float:
+        """Rotation of the upper camera against the rig's file, degrees; NaN where it is unknown."""
+        return float(np.rad2deg(np.linalg.norm(self.drift.turn))) if self.drift else math.nan
+
+    @property
+    def summary(self) -> str:
+        """Summary in one line."""
+        if self.drift is None:
+            return f"{self.state}: {self.matches} of {self.tried} points found in both panoramas"
+        x, y, z = np.rad2deg(self.drift.turn)
+        return (
+            f"{self.state}: upper camera turned by {self.turn_deg:.3f} deg, sigma "
+            f"{np.rad2deg(self.drift.angle_sigma):.3f} ({x:+.3f} {y:+.3f} {z:+.3f}), by {self.matches} points"
+        )
+
+
+def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure: Exposure | None = None) -> Matches:
+    """Return the corners of the lower panorama found in the upper one, by coarse search and tracking.
+
+    exposure: the motion between the exposures of the pair, for which the pixels are corrected; None: none.
+    """
+    # 1. Corners of the lower panorama, and the best place of each in the upper one, both reduced.
+    points = corners(lower, visible, POINTS)
+    small_lower, small_upper = (_reduced(padded.image) for padded in (lower, upper))
+    aside, down_most = at_scale(ASIDE_PX, lower.scale), at_scale(DOWN_PX, lower.scale)
+    guess, good, clear = points.copy(), np.zeros(len(points), bool), 0
+    reduced = ((points + np.array([lower.pad_px, 0])) / COARSE).round().astype(int)
+    for index, (left, top) in enumerate((reduced - PATCH_PX).tolist()):
+        right, bottom, low = left + 2 * PATCH_PX + 1, top + 2 * PATCH_PX + 1, max(0, left - aside)
+        if left < 0 or top < 0 or right > small_lower.shape[1] or bottom > small_lower.shape[0]:
+            continue
+        patch, strip = small_lower[top:bottom, left:right], small_upper[top : bottom + down_most, low : right + aside]
+        _, best, _, (shift, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
+        guess[index] += COARSE * (low + shift - left), COARSE * down
+        good[index] = best >= MIN_CORRELATION
+        clear += bool(patch.std() > CONTRAST_GREY)
+    # 2. Track from there, to parts of a pixel.
+    there, is_tracked = track(lower, upper, points, guess, KLT)
+    # 3. Keep those that stay near the coarse place and lie lower in the upper panorama than in the lower one.
+    step = there - guess
+    step[:, 0] = lower.apart(step[:, 0])
+    good &= is_tracked & (np.abs(step).max(axis=1) < 2 * COARSE) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
+    below, above = points[good], there[good]
+    if exposure is not None:
+        # 4. Views at the stamp of the pair, where its images were exposed at several times.
+        views, _ = exposure.corrected(below, above[:, 1])
+        columns, _ = exposure.upper_columns(below, above[:, 1])
+        known = np.isfinite(columns)
+        shift_px = exposure.model.cylinder.wrap(views[known, 0] - columns[known])
+        below, above = views[known, :2], np.column_stack([above[known, 0] + shift_px, views[known, 2]])
+    return Matches(below, above, len(points), clear)
+
+
+def _reduced(image: Image) -> Image:
+    width, height = image.shape[1] // COARSE, image.shape[0] // COARSE
+    whole = image[: height * COARSE, : width * COARSE]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> RigFinding:
+    """Return what the matches of some pairs say about their rig.
+
+    exchanged: number of the matches with the cameras exchanged; 0 if that was not tried.
+    """
+    lower, upper = np.concatenate([one.lower for one in found]), np.concatenate([one.upper for one in found])
+    drift, misfit_deg, left_px = None, 0.0, math.nan
+    if len(lower) >= MIN_MATCHES:
+        # 1. The rotation and shift of the upper camera that explain the columns.
+        drift = estimate_rig_drift(cylinder.rays(lower), cylinder.rays(upper))
+        angles = (drift.turn, drift.turn_sigma), (drift.shift, drift.shift_sigma)
+        turn, shift = (float(np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma)) for angle, sigma in angles)
+        misfit_deg = math.degrees(max(turn, SHIFT_WEIGHT * shift, 0.0))
+        # 2. Residuals in each direction show changed intrinsics.
+        sector = np.floor(cylinder.azimuth(lower[:, 0]) * (SECTORS / math.tau))
+        offsets = [abs(np.median(drift.residuals[sector == number])) for number in np.unique(sector)]
+        left_px = float(np.median(offsets)) * cylinder.focal_px
+    # 3. The state by this finding alone.
+    state = RigState.FITS
+    if max(len(lower), exchanged) >= MIN_MATCHES and exchanged > len(lower):
+        state = RigState.EXCHANGED
+    elif len(lower) < MIN_MATCHES <= MIN_MATCHED_PART * sum(one.clear for one in found) or misfit_deg > BROKEN_DEG:
+        state = RigState.BROKEN
+    elif drift is None:
+        state = RigState.UNCHECKED
+    elif misfit_deg > DRIFTED_DEG or left_px > DRIFTED_PX:
+        state = RigState.DRIFTED
+    return RigFinding(state, len(lower), sum(one.tried for one in found), drift, misfit_deg, left_px)
+
+
 class RigHealth:
-    """State of the rig of a run.
+    """State of the rig of a run, by first pairs before a pose moves wheels (`begin`) and views of the drive (`drive`).
 
     mode: what a contradiction by the first pairs does: "refuse" raises RigContradictedError, "warn" keeps the reason in
     `warning`, "off" checks no first pairs. Where these show too little, as in darkness, later ones are used, and until
-    then the rig counts as fitting.
+    then the rig counts as fitting. Views of the drive overrule the first pairs unless the cameras are exchanged. Two
+    threads may call the two; each sets its finding in one assignment, and any thread may read the state.
     """
 
     def __init__(self, cylinder: Cylinder, mode: str, every_s: float = 0.0) -> None:
-        """every_s: time between two views of the drive; 0: none is used."""
-        self._cylinder, self._mode = cylinder, mode
+        """every_s: time between two rounds of first pairs that show too little, and between two views of the drive."""
+        self._cylinder, self._mode, self._every_ns = cylinder, mode, round(every_s * 1e9)
         self.state = RigState.UNCHECKED
         self.finding: RigFinding | None = None  # the newest one
-        self.is_checking = mode != "off"  # True while first pairs, or those of a later check, are needed
-        # The round under way: matches as the rig says, and with the cameras exchanged.
+        # The round of first pairs under way: matches as the rig says, and with the cameras exchanged.
         self._round: list[tuple[Matches, Matches]] = []
         self._next_ns, self._is_contradicted, self._unknown_pairs = -math.inf, False, 0
-        self.uses_views = every_s > 0  # True if views of the drive are used
-        self._every_ns, self._used_ns = every_s * 1e9, math.inf
-        self._views: deque[Matches] = deque(maxlen=VIEWS)
-        self._view_at: Array | None = None  # (3,) m: where the newest of them was seen
-        self.new_views = 0  # views of the drive since the last whole check
-        self._has_views = False  # True after a finding by views of the drive
+        self.views: deque[Matches] = deque(maxlen=VIEWS)
+        self._next_view_ns, self._view_at = -math.inf, np.full(3, math.inf)  # m
+
+    @property
+    def is_checking(self) -> bool:
+        """True while first pairs are needed."""
+        return self._mode != "off" and self.state is RigState.UNCHECKED
 
     @property
     def warning(self) -> str:
         """One line about a rig that the images contradict, or could not check, and what to do; else empty."""
-        state, finding = self.state, self.finding
-        if finding is None or state is RigState.FITS:
+        if (finding := self.finding) is None:
             return ""
-        if state is RigState.EXCHANGED:
-            return (
-                "the images match better the other way round: exchange --lower and --upper, or the cameras in the "
-                "configuration; if that does not help, the rig is that of other cameras"
-            )
-        if state is RigState.BROKEN:
-            return (
-                "the images contradict the rig: a camera is covered, or the upper one is turned by "
-                f"{finding.turn_deg:.1f} deg by {finding.matches} points: {CALIBRATE}"
-            )
-        if state is RigState.UNCHECKED:
-            return (
-                "the rig could not be checked by the images: too few points are seen by both cameras; are they "
-                "dark, covered or unsharp?"
-            )
-        rough = ""
-        if self._unknown_pairs > VIEWS:
-            rough = " (to 2 deg, as the cameras are not synchronised, and the motion between them is not known)"
-        return (
-            f"the images do not quite fit the rig{rough}, {finding.summary}: run `omnid calibrate drive --only check` "
-            "on a recording of slow driving; -o corrects the rotation of the upper camera"
-        )
+        calibrate = "`omnid calibrate drive` on a recording of driving"
+        words = {
+            RigState.EXCHANGED: "the images match better the other way round: exchange --lower and --upper, or the "
+            "cameras in the configuration; if that does not help, the rig is that of other cameras",
+            RigState.BROKEN: "the images contradict the rig: a camera is covered, or the upper one is turned by "
+            f"{finding.turn_deg:.1f} deg by {finding.matches} points: give its own rig, or use {calibrate}",
+            RigState.UNCHECKED: "the rig could not be checked by the images: too few points are seen by both cameras; "
+            "are they dark, covered or unsharp?",
+            RigState.DRIFTED: f"the images do not quite fit the rig, {finding.summary}: use {calibrate}",
+        }
+        return words.get(self.state, "")
 
-    def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
+    def begin(self, pair: Panoramas, exposure: Exposure | None = None) -> None:
         """Use one of the first pairs, some 30 ms of work; RigContradictedError where the mode is to refuse the rig.
 
         A right rig is decided in one round, a contradiction needs two in a row, because a hand before a mirror passes.
         A round with too few matches decides nothing. exposure: the motion between the exposures of a pair that is not
-        synchronised. A later check, after a loss, ends no run: it is repeated until the rig fits.
+        synchronised.
         """
-        # 1. A new round that confirms nothing begins some time after the last one.
+        # 1. A new round begins some time after one that confirmed nothing.
         if not self.is_checking or (not self._round and pair.stamp_ns < self._next_ns):
             return
         # 2. Wait for pairs whose motion is known, if not for long.
-        if is_motion_unknown(pair, exposure):
+        if _is_motion_unknown(pair, exposure):
             self._unknown_pairs, exposure = self._unknown_pairs + 1, None
             if self._unknown_pairs <= VIEWS:
                 return
         # 3. Match it as the rig says, and with the cameras exchanged, until the round has matches enough.
         own = match(pair.lower, pair.upper, pair.visible, exposure)
         self._round.append((own, match(pair.upper, pair.lower, pair.visible)))
-        found, exchanged = (together(matches) for matches in zip(*self._round, strict=True))
-        pairs, is_enough = len(self._round), len(found.lower) + len(exchanged.lower) >= MIN_MATCHES
-        if pairs < 2 or (pairs < VIEWS and not is_enough):
+        found, exchanged = zip(*self._round, strict=True)
+        count = sum(len(one.lower) for one in exchanged)
+        is_enough = count + sum(len(one.lower) for one in found) >= MIN_MATCHES
+        if len(found) < 2 or (len(found) < VIEWS and not is_enough):
             return
-        finding = judge(found, self._cylinder, len(exchanged.lower))
-        state, was_contradicted = finding.state, self._is_contradicted
-        self._round, self._is_contradicted = [], state.is_contradicted
+        finding = judge(found, self._cylinder, count)
+        was_contradicted, self._is_contradicted = self._is_contradicted, finding.state.is_contradicted
+        self._round = []
         # 4. The second of two contradictions, or any other result, counts.
-        if state.is_contradicted and not was_contradicted:
+        if self._is_contradicted and not was_contradicted:
             return
-        self._next_ns = pair.stamp_ns + RETRY_NS
-        is_first = self.state is RigState.UNCHECKED
-        is_newer = not self._has_views or RigState.EXCHANGED in (state, self.state)
-        if is_first or (is_newer and state is not RigState.UNCHECKED):
-            self.finding, self.state = finding, state
-        if is_first and state.is_contradicted and self._mode == "refuse":
+        self._next_ns = pair.stamp_ns + self._every_ns
+        self.finding, self.state = finding, finding.state
+        if self._is_contradicted and self._mode == "refuse":
             raise RigContradictedError(self.warning)
-        self.is_checking = state is RigState.UNCHECKED or (state.is_contradicted and not is_first)
 
-    def check_again(self) -> None:
-        """Check the next pairs as the first ones, as the pose was lost: cables may have been exchanged meanwhile.
-
-        The state stays as it is while the pairs show too little.
-        """
-        if self._mode != "off" and not self.is_checking:
-            self.is_checking, self._is_contradicted, self._next_ns = True, False, -math.inf
-
-    def drive(self, pair: PanoramaPair, position: Array, exposure: Exposure | None = None) -> None:
+    def drive(self, pair: Panoramas, position: Array, exposure: Exposure | None = None) -> None:
         """Use a pair of the drive if it is due; a finding changes the state unless it saw too little.
 
         position (3,) [m] of the rig in odom; exposure: as in `begin`. The newest views count, so that older ones are
         forgotten with the path. Only pairs of `begin` show that cameras are exchanged, and no longer. A view of a new
-        place takes 10 to 20 ms, a check after VIEWS of them 20 to 50 ms more, all other pairs almost nothing.
+        place takes 10 to 20 ms, and 20 to 50 ms more from VIEWS of them on, all other pairs almost nothing.
         """
         # 1. A pair that is due, of another place, and whose motion is known.
-        is_due = not self._used_ns <= pair.stamp_ns < self._used_ns + self._every_ns
-        is_new = self._view_at is None or float(np.linalg.norm(position - self._view_at)) >= VIEW_M
-        if not (self.uses_views and is_due and is_new) or is_motion_unknown(pair, exposure):
+        is_new = not np.linalg.norm(position - self._view_at) < VIEW_M
+        if pair.stamp_ns < self._next_view_ns or not is_new or _is_motion_unknown(pair, exposure):
             return
-        self._used_ns, self._view_at = pair.stamp_ns, position
-        self._views.append(match(pair.lower, pair.upper, pair.visible, exposure))
-        self.new_views += 1
-        # 2. A whole check, after enough new views; the newest views alone may show a broken rig.
-        is_whole = self.new_views >= VIEWS
-        if not is_whole and len(self._views) < RECENT_VIEWS:
+        self._next_view_ns, self._view_at = pair.stamp_ns + self._every_ns, position
+        self.views.append(match(pair.lower, pair.upper, pair.visible, exposure))
+        # 2. The newest views alone may show a broken rig, all of them any other state.
+        if len(self.views) < RECENT_VIEWS or self.state is RigState.EXCHANGED:
             return
-        finding = judge(together(list(self._views)[0 if is_whole else -RECENT_VIEWS :]), self._cylinder)
-        if is_whole:
-            self.new_views = 0
-        elif finding.misfit_deg <= BROKEN_DEG:
-            return
-        if finding.state is not RigState.UNCHECKED and self.state is not RigState.EXCHANGED:
-            self.finding, self.state, self._has_views = finding, finding.state, True
+        finding = judge(list(islice(self.views, len(self.views) - RECENT_VIEWS, None)), self._cylinder)
+        if finding.misfit_deg <= BROKEN_DEG:
+            if len(self.views) < VIEWS:
+                return
+            finding = judge(list(self.views), self._cylinder)
+        if finding.state is not RigState.UNCHECKED:
+            self.finding, self.state = finding, finding.state
+
+
+def _is_motion_unknown(pair: Panoramas, exposure: Exposure | None) -> bool:
+    """True if a pair has several times of exposure and the motion in between, which looks like drift, is unknown."""
+    return not pair.times.is_at_once and (exposure is None or not exposure.is_known)

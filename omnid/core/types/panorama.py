@@ -1,13 +1,17 @@
-"""Image of a panorama: a full turn that wraps around, or a sector with two ends."""
+"""Image of a panorama, a full turn that wraps around or a sector with two ends; and both panoramas of a pair."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.jpeg import Steps
+from drivers.motion import MotionSample
+from omnid.core.stereo.photometry import Light
+from omnid.core.stereo.tiles import ALL_LIVE, TileStates
+from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -69,3 +73,24 @@ class PaddedPanorama:
     def apart(self, columns: Array) -> Array:
         """Return differences (N,) of columns, the short way around a full turn."""
         return np.asarray((columns + self.period_px / 2) % self.period_px - self.period_px / 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class Panoramas:
+    """Both images on the cylinder about the line through the viewpoints: epipolar lines are columns."""
+
+    seq: int
+    stamp_ns: int
+    lower: PaddedPanorama
+    upper: PaddedPanorama
+    visible: Flags  # (H, W) both cameras show the world here and in a tracking window around
+    times: PixelTimes = AT_ONCE
+    light: Light = field(default_factory=Light)
+    motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
+    tiles: TileStates = ALL_LIVE  # the parts of the images that are dead or blind
+
+    @property
+    def usable(self) -> Flags:
+        """Pixels (H, W) that show the world in live parts of both images."""
+        lost = self.tiles.lost_pixels(self.visible.shape)
+        return self.visible if lost is None else self.visible & ~lost

@@ -20,8 +20,8 @@ from omnid.core.odometry.paper.paper_odometry import turned_track
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings, correlation_peaks, flow
 from omnid.core.stereo.matcher import edge_pixels, smooth
+from omnid.core.types.panorama import Panoramas
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.messages import Panoramas
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.stages.dense_depths import DenseDepths

@@ -16,7 +16,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.messages import Panoramas
+from omnid.core.types.panorama import Panoramas
 from omnid.simulation.rendering.surfaces import CEILING_M, PAINTERS, Rectangle, Scene
 from omnid.simulation.world_file import load_world
 from omnid.stages.dewarp import Dewarp

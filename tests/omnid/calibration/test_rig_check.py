@@ -16,7 +16,7 @@ from omnid.calibration.images import BY_NAME
 from omnid.calibration.rig_check import RigCheckResult, check_rig, read_rig_pairs
 from omnid.cli import main
 from omnid.config import PanoramaConfig
-from omnid.core.rig.column_finding import RigState
+from omnid.core.rig.rig_health import RigState
 from omnid.messages import FramePair
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log

@@ -18,9 +18,9 @@ from drivers.logs.rotating_log import RotationSettings
 from drivers.motor import VelocityCommand
 from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.panorama import PaddedPanorama, Panoramas
 from omnid.engine.robot_clock import RobotClock
-from omnid.messages import MapUpdate, OdometryUpdate, Panoramas, StereoDepth
+from omnid.messages import MapUpdate, OdometryUpdate, StereoDepth
 from omnid.runs.live import open_recorder
 from omnid.sinks.encoder import Encoder
 from omnid.transport.codec import ERROR, OK, Diagnostics, DiagnosticStatus

@@ -12,7 +12,8 @@ from calib import se3
 from omnid.config import Config, MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.messages import DensePoints, OdometryUpdate, Panoramas, PlaceUpdate, StereoDepth
+from omnid.core.types.panorama import Panoramas
+from omnid.messages import DensePoints, OdometryUpdate, PlaceUpdate, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.mapping import MapGrid, Mapping

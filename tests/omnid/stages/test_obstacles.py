@@ -16,7 +16,8 @@ from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.grid import FREE, OCCUPIED, REACH_CELLS, UNKNOWN
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.stereo.tiles import TILE_COLUMNS
-from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate, Panoramas, StereoDepth
+from omnid.core.types.panorama import Panoramas
+from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate, StereoDepth
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
