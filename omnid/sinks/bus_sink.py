@@ -9,7 +9,7 @@ import cv2
 from calib import se3
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
-from omnid.core.mapping.thinned_path import ThinnedPath
+from omnid.core.mapping.voxel_map import ThinnedPath
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, UnixTime, pose_attachment

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeGrid
-from omnid.core.mapping.thinned_path import ThinnedPath
-from omnid.core.mapping.voxel_map import VoxelMap
+from omnid.core.mapping.voxel_map import ThinnedPath, VoxelMap
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.stages.dense_depths import DenseDepths

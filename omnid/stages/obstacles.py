@@ -18,10 +18,9 @@ from omnid.config import ObstaclesConfig
 from omnid.core import frames
 from omnid.core.control.collision_monitor import ControllerScan, MovingPoint
 from omnid.core.floor import Floor, FloorEstimator
-from omnid.core.mapping.range_scan import SECTORS, FreeRanges
+from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.moving_tracker import MovingTracker
-from omnid.core.obstacles.posterior import thin_things_m
 from omnid.core.obstacles.ray_scans import RayScans
 from omnid.core.stereo.tiles import tile_columns
 from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
@@ -146,7 +145,7 @@ class Obstacles:
             self._resets = odometry.reset_counter
         if is_again or is_lost:
             self._tracker = MovingTracker()
-        panoramas, self.scans.belief = odometry.depth.panoramas, None
+        panoramas = odometry.depth.panoramas
         T_odom_base = frames.of_base(odometry, self._geometry.rig.T_base_rig)[0]
         tiles, of_base = panoramas.tiles, (self._geometry.cylinder, self._T_base_rect)
         unwatched = sectors_of(tiles.unknown, *of_base, UNWATCHED_M)
@@ -177,15 +176,6 @@ class Obstacles:
             moving=moving,
             grid=scan.grid,
         )
-
-    @property
-    def thin_m(self) -> FreeRanges:
-        """Least range (SECTORS,) [m] at which something thin hides floor by the newest pair, inf: nothing does.
-
-        Sectors are those of the rectified frame.
-        """
-        belief = self.scans.belief
-        return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief)
 
 
 def controller_scan(scan: ObstacleScan) -> ControllerScan:

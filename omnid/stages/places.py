@@ -122,13 +122,12 @@ class Places:
         dense = self._dense.of(odometry.depth)
         self.floor.add(dense)
         scan = self._obstacles.scan(odometry)
-        return keyframe_ranges(dense, scan, self._obstacles.thin_m, self.floor, self._T_rig_rect, self._limits)
+        return keyframe_ranges(dense, scan, self.floor, self._T_rig_rect, self._limits)
 
 
 def keyframe_ranges(
     depth: DensePoints,
     scan: ObstacleScan,
-    thin_m: FreeRanges,
     camera_floor: CameraFloor,
     T_rig_rect: Array,
     settings: ScanSettings,
@@ -136,7 +135,6 @@ def keyframe_ranges(
     """Return the ranges of a keyframe and up to where its floor is free, (SECTORS,) by azimuth in the rectified frame.
 
     They are turned level, and those of the floor below the lower viewpoint. scan: of obstacles at the keyframe.
-    thin_m (SECTORS,): where something thin may begin to hide the floor, inf: nowhere; there the free ones are negative.
     """
     floor = camera_floor.floor
     if floor is None:
@@ -151,5 +149,4 @@ def keyframe_ranges(
     limits = settings.heights_m, math.radians(settings.tilt_deg), settings.min_points
     ranges = point_scan(points, np.sqrt(depth.variance_m2), view, *limits, floor.sigma_m)
     # 3. The free floor by the obstacle scan.
-    free_m = np.minimum(seen_from(scan.free_m, T_level_floor), np.float32(MAX_RANGE_M))
-    return ranges, np.where(np.isfinite(thin_m), -np.minimum(free_m, thin_m), free_m)
+    return ranges, np.minimum(seen_from(scan.free_m, T_level_floor), np.float32(MAX_RANGE_M))

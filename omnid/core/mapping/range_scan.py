@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from calib import se3
 
 Array = NDArray[np.float64]
-Counts = NDArray[np.intp]
 
 # Sectors of one degree are as wide as a cell of the map, 5 cm, at 3 m.
 SECTORS: Final = 360
@@ -33,8 +32,7 @@ NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base.
 
 # Ranges (SECTORS,) [m] of the sectors in the order of azimuth, from -pi on. NaN: no obstacle was seen.
 RangeScan = NDArray[np.float32]
-# Ranges (SECTORS,) [m] in the same order, up to which the floor was seen without anything on it; 0: nowhere. Those of
-# keyframes are negative where something thin, such as a pole, hides the floor from there on (obstacles/posterior.py).
+# Ranges (SECTORS,) [m] in the same order, up to which the floor was seen without anything on it; 0: nowhere.
 FreeRanges = NDArray[np.float32]
 
 
@@ -55,27 +53,6 @@ def seen_from(free_m: FreeRanges, T_view_base: Array) -> FreeRanges:
     # The end of a free range may lie on the border of two sectors: it counts for the sectors on both sides.
     nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1), np.roll(nearest, -1)))
     return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
-
-
-def fill_gaps(scan: RangeScan) -> RangeScan:
-    """Return the scan (SECTORS,) with short gaps filled, where the ranges on both sides are those of one surface.
-
-    Sparse stereo measures edges only, so a plain wall between two edges appears as a gap.
-    """
-    known = np.flatnonzero(np.isfinite(scan))
-    if len(known) < 2:
-        return scan
-    following = np.roll(known, -1)
-    gap = (following - known) % SECTORS - 1
-    a, b = scan[known], scan[following]
-    is_surface = (gap >= 1) & (gap <= FILLED_SECTORS) & (np.maximum(a, b) <= SURFACE_RATIO * np.minimum(a, b))
-    filled = scan.copy()
-    for step in range(1, FILLED_SECTORS + 1):
-        chosen = is_surface & (gap >= step)
-        share = step / (gap[chosen] + 1)
-        # A flat wall is linear in 1 / range, as long as the sectors are narrow.
-        filled[(known[chosen] + step) % SECTORS] = 1 / ((1 - share) / a[chosen] + share / b[chosen])
-    return filled
 
 
 def point_scan(
@@ -117,9 +94,20 @@ def point_scan(
     first = supported.argmax(axis=1)[:, None]
     point_count, inverse_sum = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))
     found = np.divide(point_count, inverse_sum, out=np.full(SECTORS, np.nan), where=supported.any(axis=1))
-    return fill_gaps(np.where(found > MAX_RANGE_M, np.nan, found).astype(np.float32))
+    scan = np.where(found > MAX_RANGE_M, np.nan, found).astype(np.float32)
+    # 4. Short gaps where the ranges on both sides are those of one surface: sparse stereo measures edges only, so a
+    #    plain wall between two edges appears as a gap. A flat wall is linear in 1 / range.
+    known = np.flatnonzero(np.isfinite(scan))
+    following = np.roll(known, -1)
+    gap, a, b = (following - known) % SECTORS - 1, scan[known], scan[following]
+    is_surface = (gap >= 1) & (gap <= FILLED_SECTORS) & (np.maximum(a, b) <= SURFACE_RATIO * np.minimum(a, b))
+    for step in range(1, FILLED_SECTORS + 1):
+        chosen = is_surface & (gap >= step)
+        share = step / (gap[chosen] + 1)
+        scan[(known[chosen] + step) % SECTORS] = 1 / ((1 - share) / a[chosen] + share / b[chosen])
+    return scan
 
 
-def _sectors(x: Array, y: Array) -> Counts:
+def _sectors(x: Array, y: Array) -> NDArray[np.intp]:
     """Return the sectors (N,) of places (N,)."""
     return np.floor((np.arctan2(y, x) + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS

@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.mapping.range_scan import SECTORS, SURFACE_RATIO, azimuths
+from omnid.core.mapping.range_scan import SURFACE_RATIO, azimuths
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # exact: the values of nav_msgs/msg/OccupancyGrid of ROS
-# Bounds of the grid of a file and of a live one: 140 and 50 m square at cells of 0.05 m, of three bytes each.
+# Bounds of the grid of a file and of a live one: 140 and 50 m square at cells of 0.05 m, of two bytes each.
 MAX_CELLS: Final = 8_000_000
 MAX_LIVE_CELLS: Final = 1_000_000
 MARGIN_M: Final = 5.0  # around the area of the scans, so that it need not grow with each of them
@@ -35,18 +35,11 @@ HIT, MISS = 9, 4
 LIMITS: Final = (-5 * MISS, 4 * HIT - 1)
 # A cell is occupied from two hits on and free from two misses on, because a single view may be a false match.
 OCCUPIED_FROM, FREE_UNTIL = 2 * HIT - MISS, -2 * MISS
-# Limits for what is narrow: after two near views through a cell three that end there make it unknown.
-NARROW_LIMITS: Final = (-2 * MISS, 3 * MISS)
 # From this far on a cell is free only where a view has seen through the whole of it, so that what is narrower than a
 # cell and shows no range, as a plain pole, is unknown; nearer is the base itself. By trial on a development seed.
 WHOLE_M: Final = 0.5
-# Factors [1/m] of the squared range, as the noise of stereo grows like that: the free space ends by so much before an
-# obstacle, and what is narrow and ends the free floor may stand so much farther (four disparities of the usual rig).
-SHORTER, NARROW = 0.02, 0.14
-# What is narrow and ends the floor nearer than the first may stand anywhere before it, because nearer floor may be out
-# of view. From farther away than the second a view through a cell is not sure that nothing narrow stands there: one
-# view shows 64 % of plain poles of 3 to 4.5 cm from 1.3 to 1.7 m, 21 % from 1.7 to 2.6 m (development seed 1).
-TOO_NEAR_M, SURE_M = 1.0, 1.5
+# Factor [1/m] of the squared range by which the free space ends before an obstacle, as the noise of stereo grows so.
+SHORTER: Final = 0.02
 SHIFT: Final = 4  # fractional bits of the polygons' corners: a sixteenth of a cell is enough
 # The grid is drawn again when a keyframe has moved by half a cell, or a wall at this distance by its turn.
 WALL_M: Final = 5.0
@@ -78,7 +71,7 @@ class KeyframeGrid:
         """max_cells: the size of a cell is doubled until they suffice."""
         self._wanted_m, self._max_cells = cell_m, max_cells
         self._drawn: dict[int, Array] = {}  # x, y [m], yaw [rad] of the keyframes in it
-        self._area = np.array([[np.inf] * 2, [-np.inf] * 2])  # lowest and highest x, y [m]
+        self._area, self._cell_m = np.array([[np.inf] * 2, [-np.inf] * 2]), cell_m  # lowest and highest x, y [m]
 
     def draw(self, keyframes: KeyframeScans, T_base_rect: Array) -> Grid:
         """Return the known part of the grid, in the axes of the base at the start of the map."""
@@ -90,7 +83,8 @@ class KeyframeGrid:
         near = np.vstack([planar[:, :2] - reach, planar[:, :2] + reach]) if len(planar) else np.zeros((1, 2))
         needed = np.array([near.min(axis=0), near.max(axis=0)])
         fits = (needed[0] >= self._area[0]).all() and (needed[1] <= self._area[1]).all()
-        if not fits or any(id not in now or self._has_moved(before, now[id]) for id, before in self._drawn.items()):
+        moved = [np.abs((before - now.get(id, np.inf)) * [1, 1, WALL_M]).max() for id, before in self._drawn.items()]
+        if not fits or max(moved, default=0.0) > self._cell_m / 2:
             self._clear(needed + np.array([[-MARGIN_M], [MARGIN_M]]))
         # 2. The new scans, the oldest first, because later ones count more.
         for id, pose in now.items():
@@ -100,11 +94,6 @@ class KeyframeGrid:
                 self._drawn[id] = pose
         return self._known_part()
 
-    def _has_moved(self, before: Array, now: Array) -> bool:
-        """True if a keyframe has moved from where it was drawn."""
-        turned_m = WALL_M * math.remainder(now[2] - before[2], math.tau)
-        return max(math.dist(before[:2], now[:2]), abs(turned_m)) > self._cell_m / 2
-
     def _clear(self, area: Array) -> None:
         """Begin an empty grid of an area (2, 2) [m]."""
         self._area, self._cell_m, self._drawn = area, self._wanted_m, {}
@@ -112,14 +101,11 @@ class KeyframeGrid:
             self._cell_m *= 2
         self._first = np.floor(area[0] / self._cell_m)
         width, height = (np.floor(area[1] / self._cell_m) - self._first + 1).astype(int)
-        # Of obstacles; of the floor, by the views that have seen it; of what is narrow, by views that end, or pass it.
-        self._odds, self._floor_odds, self._narrow_odds = np.zeros((3, height, width), np.int8)
+        # Of obstacles; of the floor, by the views that have seen it.
+        self._odds, self._floor_odds = np.zeros((2, height, width), np.int8)
 
     def _add(self, scan: Ranges, free_m: Ranges, pose: Array) -> None:
-        """Add a scan (SECTORS,) at x, y, yaw, and up to where floor was seen there.
-
-        free_m (SECTORS,): negative where something narrow hides the floor from there on.
-        """
+        """Add a scan (SECTORS,) at x, y, yaw, and up to where floor was seen there, free_m (SECTORS,)."""
         # 1. The ends of the ranges in cells, and the part of the grid in which they lie.
         known, angles = np.isfinite(scan), azimuths() + pose[2]
         ranges = np.where(known, scan, np.inf)
@@ -136,29 +122,21 @@ class KeyframeGrid:
         neighbours = [np.roll(ranges, shift) for shift in (-2, -1, 0, 1, 2)]
         nearest = np.where(known, np.min(neighbours, axis=0), 0.0)
         through_m = np.maximum(nearest - self._cell_m - SHORTER * nearest**2, 0.0)
-        floor_m = np.minimum(through_m, np.abs(free_m))
-        whole = WHOLE_M / self._cell_m
-        through, floor, passed = (
-            _polygon(shape, centre, centre + range_m[:, None] * direction, whole)
-            for range_m in (through_m, floor_m, np.minimum(floor_m, SURE_M))
-        )
+        floor_m = np.minimum(through_m, np.maximum(free_m, 0.0))
         # 3. The obstacles, and the sum of both; a cell with an obstacle is not free.
         hit = _hits(shape, scan, ends)
-        for odds, free in ((self._odds[part], through), (self._floor_odds[part], floor)):
+        for odds, range_m in ((self._odds[part], through_m), (self._floor_odds[part], floor_m)):
+            free = _polygon(shape, centre, centre + range_m[:, None] * direction, WHOLE_M / self._cell_m)
             np.clip(odds + np.where(hit, HIT, -MISS * free), *LIMITS, out=odds, casting="unsafe")
-        # 4. What is narrow stands in one of the cells where the floor ends, and in none that is passed near by.
-        odds, ended = self._narrow_odds[part], _ends_of_floor(shape, centre, free_m, direction)
-        np.clip(odds + np.where(ended, MISS, -MISS * passed), *NARROW_LIMITS, out=odds, casting="unsafe")
 
     def _known_part(self) -> Grid:
         """Return the part with known cells; a cell is free where its floor was seen.
 
-        It is not where the views that something narrow ends are two more than those that pass it near by, nor next to
-        an occupied one, as an obstacle is known to a cell only.
+        It is not next to an occupied one, as an obstacle is known to a cell only.
         """
         is_occupied = self._odds >= OCCUPIED_FROM
         near = cv2.dilate(is_occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        is_free = (self._floor_odds <= FREE_UNTIL) & (self._narrow_odds <= MISS) & ~near
+        is_free = (self._floor_odds <= FREE_UNTIL) & ~near
         cells = np.where(is_occupied, OCCUPIED, np.where(is_free, FREE, UNKNOWN)).astype(np.int8)
         rows, columns = np.nonzero(cells != UNKNOWN)
         top, left = (int(rows.min()), int(columns.min())) if len(rows) else (0, 0)
@@ -183,21 +161,6 @@ def _polygon(shape: tuple[int, ...], centre: Array, ends: Array, whole: float) -
     cv2.polylines(outline, [_fixed_point(ends)], True, 1, shift=SHIFT)
     cv2.circle(outline, _fixed_point(centre).tolist(), round(whole * 2**SHIFT), 0, cv2.FILLED, shift=SHIFT)
     return np.asarray((cells & ~outline & 1).view(np.int8))
-
-
-def _ends_of_floor(shape: tuple[int, ...], centre: Array, free_m: Ranges, direction: Array) -> NDArray[np.bool_]:
-    """Return the cells in which something narrow may stand that ends a view from `centre` (2,) [cells].
-
-    free_m (SECTORS,): negative where it does, along directions (SECTORS, 2) [cells/m].
-    """
-    cells, half = np.zeros(shape, np.uint8), math.pi / SECTORS
-    sides = np.stack([direction + side * half * (direction[:, ::-1] * [-1, 1]) for side in (-1, 1)])
-    for sector in np.flatnonzero(free_m < 0):
-        end_m = -float(free_m[sector])
-        near_m, far_m = end_m if end_m > TOO_NEAR_M else 0.0, end_m + NARROW * end_m**2
-        corners = np.concatenate([near_m * sides[:, sector], far_m * sides[::-1, sector]])
-        cv2.fillConvexPoly(cells, _fixed_point(centre + corners), 1, shift=SHIFT)
-    return cells.view(bool)
 
 
 def _hits(shape: tuple[int, ...], scan: Ranges, ends: Array) -> NDArray[np.bool_]:

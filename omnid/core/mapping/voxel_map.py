@@ -1,4 +1,4 @@
-"""Voxel map in bounded memory: points of all frames, in the world frame, fused in voxels.
+"""Voxel map in bounded memory: points of all frames, in the world frame, fused in voxels; and the path of a run.
 
 Dang et al. 2012, section IV.G: points reconstructed at each frame are transformed by the estimated motion into one
 frame and merged.
@@ -6,6 +6,7 @@ frame and merged.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,3 +101,24 @@ class VoxelMap:
         order = np.lexsort((self._confidence(), ~is_old))
         dropped = len(order) - self._most // 2
         self._voxels = self._voxels[np.sort(order[dropped:])]
+
+
+class ThinnedPath:
+    """Vertices at least a step apart, and the end of the path; when there are too many, every second one is dropped."""
+
+    def __init__(self, most: int, step_m: float) -> None:
+        """most: largest number of vertices, at least 2. step_m: spacing at first, which doubles."""
+        self._most, self._step_m = most, step_m
+        self.vertices: list[tuple[float, float]] = []  # x, y, m
+
+    def add(self, x_m: float, y_m: float) -> None:
+        """Add the next position; it takes the place of the last one while that is less than a step after another."""
+        if len(self.vertices) > 1 and math.dist(*self.vertices[-2:]) < self._step_m:
+            self.vertices.pop()
+        self.vertices.append((x_m, y_m))
+        if len(self.vertices) > self._most:
+            self.vertices, self._step_m = [*self.vertices[:-1:2], self.vertices[-1]], 2 * self._step_m
+
+    def xy(self) -> Array:
+        """Return the positions (N, 2) [m]."""
+        return np.array(self.vertices, float).reshape(-1, 2)

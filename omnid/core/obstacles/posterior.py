@@ -26,9 +26,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
-from omnid.core.obstacles.plane_view import AZIMUTHS, BINS_PER_PX, DIRECTIONS, Bins, ShownBins, pooled, turned
+from omnid.core.obstacles.plane_view import AZIMUTHS, DIRECTIONS, Bins, ShownBins, pooled, turned
 from omnid.core.obstacles.ray_kernels import PARAMETERS as P
 from omnid.core.stereo.tiles import SATURATED_GREY
 
@@ -42,7 +41,6 @@ LEAST_STEP: Final = 0.35  # sigma of a step by the rounding of greys
 TYPICAL_M: Final = 1.3  # range at which the near floor is seen
 SIDE: Final = 3  # directions on either side with which a bin is compared
 LEAST: Final = 1e-30  # density, so that logarithms are finite
-BESIDE: Final = range(5, 13)  # directions on either side of something thin: as wide as a thing of 10 cm at 1 m
 ALONG_RAD: Final = math.radians(35.0)  # about ahead and behind: floor there is assumed before any is known
 
 
@@ -54,27 +52,6 @@ class RayBelief(NamedTuple):
     view: Floats  # (DIRECTIONS, N) probability that the bin's floor is in view, 0 where it is out of sight
     surface: Floats  # (DIRECTIONS, N) log-likelihood ratio of surfaces
     ends_m: Array  # (N + 1,) range at which the bins begin, from near to far, and the end of the last
-
-
-def thin_things_m(belief: RayBelief) -> FreeRanges:
-    """Return the least range (SECTORS,) [m] at which something thin may hide the floor, inf where nothing does.
-
-    The way along such a ray ends by a risk, the probability that something stands on it, while that along the rays 5 to
-    12 directions to the left and to the right surely goes on. Sectors are those of the rectified frame. For maps, which
-    are seen from many places: floor that a pole hides is seen beside it from the next.
-    """
-    met = np.cumsum(belief.first[:, :-1], axis=1)  # (D, N)
-    beside = [np.mean([np.roll(met, side * shift, axis=0) for shift in BESIDE], axis=0) for side in (-1, 1)]
-    ends = (met > RISK) & (np.maximum(*beside) < RISK**2) & (belief.view > 0)
-    # The bin of a foot is known to two disparities.
-    bins = np.maximum(ends.argmax(axis=1) - 2 * BINS_PER_PX, 0)
-    begins_m = np.where(ends.any(axis=1), belief.ends_m[bins], np.inf)
-    # A sector has the nearest of the directions in it and next to it.
-    found, at = np.full(SECTORS, np.inf, np.float32), np.arange(len(begins_m)) + 0.5
-    for shift in (-1, 0, 1):
-        sectors = np.floor(SECTORS * (1 - (at + shift) / len(begins_m))).astype(np.intp) % SECTORS
-        np.minimum.at(found, sectors, begins_m)
-    return found
 
 
 def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -> RayBelief:

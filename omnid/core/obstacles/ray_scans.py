@@ -40,7 +40,7 @@ from omnid.core.obstacles.plane_view import (
     WorkingPair,
     floor_plane,
 )
-from omnid.core.obstacles.posterior import RayBelief, ray_belief
+from omnid.core.obstacles.posterior import ray_belief
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -152,7 +152,6 @@ class RayScans:
         self._followed_ns: int | None = None  # stamp of the last pair by which tilt and ramps were followed
         self._ramp: Ramp | None = None
         self._way = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
-        self.belief: RayBelief | None = None  # of the newest pair
 
     def set_floor(self, T_rect_base: Array, visible: Flags) -> None:
         """Take T_rect_base (4, 4), from the base level on the floor to the panoramas, and their pixels (H, W)."""
@@ -203,8 +202,8 @@ class RayScans:
             shown = shown.beyond(_is_beyond(start_m, way_rad, self._floor.bins.ranges_m), on_ramp)
         # 3. The belief, with the look of floor that is known, and the grid.
         known = self.grid.is_floor(pose, self._floor.bins.ranges_m)
-        self.belief = ray_belief(shown, self._floor.bins, pair.sensor_grey, known)
-        scan = self.grid.update(stamp_ns, pose, self.belief)
+        belief = ray_belief(shown, self._floor.bins, pair.sensor_grey, known)
+        scan = self.grid.update(stamp_ns, pose, belief)
         # 4. Tilt and ramps, for the next pair.
         is_due = self._followed_ns is None or not 0 <= stamp_ns - self._followed_ns < FOLLOWED_NS
         if stands_level and (is_due or np.diag(self._P).max() > SURE_RAD**2):

@@ -182,7 +182,7 @@ def test_tiles_of_a_viewpoint_beside_the_origin_cover_near_and_far_directions() 
 ROOM_HEIGHT_M = test_floor.HEIGHT_M
 BOX_M, WALL_M = 1.4, 2.4
 AHEAD = np.abs(azimuths()) < 0.25  # of the rig, whose x is forward
-UNKNOWN_M, OPEN_M = np.full(SECTORS, np.nan, np.float32), np.full(SECTORS, np.inf, np.float32)
+UNKNOWN_M = np.full(SECTORS, np.nan, np.float32)
 NOTHING = ObstacleScan(0, 0, UNKNOWN_M, UNKNOWN_M, np.zeros(SECTORS, np.float32), np.eye(4))
 
 
@@ -210,27 +210,15 @@ def test_a_low_box_before_a_wall_is_the_nearest_obstacle(height_m: float, tilt_d
     rig = replace(make_rig(), T_base_rig=stated @ se3.inverse(tilt) if height_m else np.eye(4))
     camera_floor, seen = CameraFloor(rig, 0.0), depth(tilt)
     camera_floor.add(seen)
-    scan, _ = keyframe_ranges(seen, NOTHING, OPEN_M, camera_floor, np.eye(4), ScanSettings())
+    scan, _ = keyframe_ranges(seen, NOTHING, camera_floor, np.eye(4), ScanSettings())
     np.testing.assert_allclose(scan[AHEAD], BOX_M, atol=0.08)
     np.testing.assert_allclose(scan[np.abs(azimuths()) > 0.5], WALL_M, atol=0.15)
     assert bool(camera_floor.summary()) != bool(height_m)
 
 
-@pytest.mark.parametrize("height_m", [ROOM_HEIGHT_M, 0.0])
-def test_free_floor_ends_at_what_is_narrow_and_is_negative_there(height_m: float) -> None:
-    stated = se3.transform(np.eye(3), [0.0, 0.0, height_m])
-    free_m, narrow_m = np.full(SECTORS, 2.0, np.float32), np.full(SECTORS, np.inf, np.float32)
-    narrow_m[[1, 3]] = 1.5, 3.0
-    camera_floor = CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0)
-    scan = replace(NOTHING, free_m=free_m)
-    _, found = keyframe_ranges(depth(np.eye(4)), scan, narrow_m, camera_floor, np.eye(4), ScanSettings())
-    expected = [2.0, -1.5, 2.0, -2.0, 2.0] if height_m else [0.0] * 5
-    np.testing.assert_allclose(found[:5], expected, atol=1e-3)
-
-
 def test_without_a_floor_nothing_is_known_and_the_summary_names_it() -> None:
     camera_floor, seen = CameraFloor(make_rig(), 0.0), depth(np.eye(4), with_floor=False)
     camera_floor.add(seen)
-    scan, _ = keyframe_ranges(seen, NOTHING, OPEN_M, camera_floor, np.eye(4), ScanSettings())
+    scan, _ = keyframe_ranges(seen, NOTHING, camera_floor, np.eye(4), ScanSettings())
     assert np.isnan(scan).all()
     assert "call nothing free" in camera_floor.summary()

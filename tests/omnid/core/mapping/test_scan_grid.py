@@ -9,11 +9,9 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import (
-    SECTORS,
     FreeRanges,
     RangeScan,
     azimuths,
-    fill_gaps,
     point_scan,
     seen_from,
 )
@@ -86,36 +84,6 @@ def test_what_no_scan_shows_is_free_nowhere_as_its_floor_is_not_seen() -> None:
     inside = [(x, y) for x in np.arange(0.02, 0.4, 0.05) for y in np.arange(1.02, 1.4, 0.05)]
     assert {at(grid, x, y) for x, y in inside} == {UNKNOWN}
     assert {at(grid, x, 0.0) for x in np.arange(-2.5, 6.5, 0.1)} == {FREE}
-
-
-def test_views_that_something_narrow_ends_outvote_those_that_have_missed_it() -> None:
-    """A pole at (0.2, 1): three of ten views miss it, and one sees something narrow where nothing stands."""
-    path, scans, free_m = np.array([pose(x, 0, 0) for x in np.arange(-1.3, 1.7, 0.3)]), [], []
-    for n, T in enumerate(path):
-        free = OPEN.copy()
-        if n % 4:
-            range_m = np.hypot(1.0, 0.2 - T[0, 3])
-            hidden = np.abs(np.arctan2(1.0, 0.2 - T[0, 3]) - azimuths()) < 0.02 / range_m + np.deg2rad(0.5)
-            free[hidden] = -(range_m - 0.1)
-        scans.append(scan_of(ROOM, T))
-        free_m.append(free)
-    free_m[5][90] = -1.2  # to the right
-    grid = scan_grid(scans, free_m, path)
-    assert {at(grid, 0.2 + dx, 1.0 + dy) for dx in (-0.02, 0.02) for dy in (-0.02, 0.02)} == {UNKNOWN}
-    assert {at(grid, 0.2 + dx, 1.0) for dx in (-0.3, 0.3)} | {at(grid, 0.2, y) for y in (0.7, 1.5)} == {FREE}
-    assert {at(grid, path[5, 0, 3], y) for y in np.arange(-1.6, -0.5, 0.05)} == {FREE}
-
-
-def test_what_is_narrow_is_cleared_by_near_views_that_pass_it_and_not_by_far_ones() -> None:
-    near_view, far_view = pose(0.2, 0, 0), pose(2.4, -0.9, 0)  # 1.2 m and 3 m from a pole at (0.2, 1.2)
-    ended = OPEN.copy()
-    ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -1.1  # to the left
-    seen = [(near_view, ended)] * 2 + [(far_view, OPEN)] * 9
-    for more, expected in ((0, UNKNOWN), (1, FREE)):
-        views = seen + [(near_view, OPEN)] * more
-        path = np.array([T for T, _ in views])
-        grid = scan_grid([scan_of(ROOM, T) for T in path], [free for _, free in views], path)
-        assert at(grid, 0.2, 1.2) == expected and at(grid, 0.2, 0.8) == FREE
 
 
 # The grid of keyframes that are added and moved: as one that is drawn at once, and drawn again only if it must be.
@@ -218,13 +186,10 @@ def test_a_box_before_a_wall_is_found_although_most_points_are_of_the_wall() -> 
 @pytest.mark.parametrize(("gap", "far_m", "is_filled"), [(4, 3.0, True), (5, 3.0, False), (4, 5.0, False)])
 def test_short_gaps_of_one_surface_are_filled(gap: int, far_m: float, is_filled: bool) -> None:
     """Across the seam between the last sector and the first."""
-    ranges = np.full(SECTORS, 3.0, np.float32)
-    ranges[gap - 2 : 90] = far_m
-    ranges[[k % SECTORS for k in range(-2, gap - 2)]] = np.nan
-    found = fill_gaps(ranges)
-    assert np.isfinite(found[[-2, -1, 0, 1]]).all() == is_filled
+    scan = scan_seen(arc(3.0, (120, 178), (-0.9, 0.7)), arc(far_m, (gap - 182, -120), (-0.9, 0.7)))
+    assert np.isfinite(scan[[-2, -1, 0, 1]]).all() == is_filled
     if is_filled:
-        np.testing.assert_allclose(found, 3.0, rtol=1e-6)
+        np.testing.assert_allclose(scan[[-2, -1, 0, 1]], 3.0, atol=0.02)
 
 
 def test_free_ranges_of_a_base_are_those_of_the_room_from_a_turned_viewpoint_on_it() -> None:
