@@ -28,7 +28,7 @@ from calib.models.names import MODELS, camera_of, is_coefficient, model_name, na
 from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import DECIMALS, TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
-from calib.typed_toml import convert, shown, table_of
+from calib.typed_toml import convert, shown, table_of, toml_value
 from calib.validation import read_bytes, require_image_size, transform_of
 
 # Version of the file and of its table [covariance]: it rises when an earlier program would misread them.
@@ -249,7 +249,7 @@ def rig_toml(rig: Rig) -> str:
     """Return the text of a `rig.toml`."""
     text = f"schema = {SCHEMA}\n"
     if not np.array_equal(rig.T_base_rig, np.eye(4)):  # else it is not stated
-        text += f"T_base_rig = {_value(rig.T_base_rig.tolist())}\n"
+        text += f"T_base_rig = {toml_value(rig.T_base_rig.tolist())}\n"
     for (side, mounted), topic in zip(rig.sides, rig.topics, strict=True):
         camera, T_rig_cam = mounted.camera, se3.inverse(mounted.T_cam_rig)
         # Two inversions round differently, and rounding makes the text reproducible.
@@ -291,22 +291,5 @@ def _intrinsics(camera: OmniCamera) -> Mapping[str, object]:
 
 def _table_text(name: str, values: Mapping[str, object]) -> str:
     """Return a table of TOML without the keys whose value is None."""
-    lines = [f"{key} = {_value(value)}" for key, value in values.items() if value is not None]
+    lines = [f"{key} = {toml_value(value)}" for key, value in values.items() if value is not None]
     return "\n".join(["", f"[{name}]", *lines]) + "\n"
-
-
-def _value(value: object) -> str:
-    """Return a value as TOML text; a number parses to the same bits, but -0 is written as 0.
-
-    CalibError for a file's name with bytes that are no UTF-8, as TOML holds none.
-    """
-    if isinstance(value, list | tuple):
-        if value and isinstance(value[0], list | tuple):
-            return "\n".join(["[", *(f"    {_value(row)}," for row in value), "]"])
-        return f"[{', '.join(map(_value, value))}]"
-    if not isinstance(value, str):
-        return repr(value) if type(value) is int else repr(float(value) + 0.0)  # type: ignore[arg-type]
-    if any("\ud800" <= c <= "\udfff" for c in value):
-        raise CalibError(f"a calibration file holds UTF-8 text, found {value!a}: give the file another name")
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'

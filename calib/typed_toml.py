@@ -12,6 +12,7 @@ Values are checked by msgspec, in one call. An error is one line that names the 
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import re
 import tomllib
@@ -70,6 +71,19 @@ def table_of(data: bytes) -> dict[str, Any]:
         raise ValueError(f"expected TOML in UTF-8, found another byte at offset {error.start}") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"expected TOML, found: {' '.join(str(error).split())}") from None
+
+
+def toml_value(value: object) -> str:
+    """Return a value as TOML, rows one a line; a number parses to the same bits, but -0 is written as 0."""
+    if isinstance(value, list | tuple):
+        if value and isinstance(value[0], list | tuple):
+            return "\n".join(["[", *(f"    {toml_value(row)}," for row in value), "]"])
+        return f"[{', '.join(map(toml_value, value))}]"
+    if isinstance(value, str):  # JSON's escapes are TOML's, except that TOML wants DEL escaped as well
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value) if type(value) is int else repr(float(value) + 0.0)  # type: ignore[arg-type]
 
 
 def convert(root: type[T], table: dict[str, Any], path: Path = ()) -> T:

@@ -65,21 +65,32 @@ _QUALITY: Final[dict[str, Any]] = {
 }
 
 
-class Subscription(Generic[T]):
-    """The newest message of one kind; older ones are dropped. broken: number of messages that could not be decoded."""
+class _Closing:
+    """What is closed at the end of a `with` block."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it; a second call does nothing."""
+
+
+class Subscription(_Closing, Generic[T]):
+    """The newest message of one kind; older ones, and what cannot be decoded, are dropped."""
 
     def __init__(self, session: zenoh.Session, key: str, decode: Callable[[bytes, bytes], T]) -> None:
         self._decode = decode
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
         self._latched = _queried(session, key)
-        self.broken = 0
 
     def newest(self) -> T | None:
         """Return the newest message since the last call, or None; does not block."""
-        sample = self._subscriber.try_recv()
         # The message that the robot had kept counts only until another has arrived.
         latched, self._latched = self._latched, None
-        return self._message(sample or latched)
+        return self._message(self._subscriber.try_recv() or latched)
 
     def wait(self, timeout_s: float) -> T | None:
         """Return the next message, or None after the timeout."""
@@ -102,20 +113,10 @@ class Subscription(Generic[T]):
         with suppress(zenoh.ZError):
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _message(self, sample: zenoh.Sample | None) -> T | None:
-        if sample is None:
-            return None
-        try:
-            return self._decode(sample.payload.to_bytes(), _attachment(sample))
-        except OmnidError:
-            self.broken += 1
-            return None
+        with suppress(OmnidError):
+            return None if sample is None else self._decode(sample.payload.to_bytes(), _attachment(sample))
+        return None
 
 
 def _attachment(sample: zenoh.Sample) -> bytes:
@@ -128,7 +129,7 @@ def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
     return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
-class Robot:
+class Robot(_Closing):
     """A connection to a robot, direct or through a router; it is ended once.
 
     settings: section [bus] of omnid's configuration, for TLS and passwords, which its file `config` holds.
@@ -142,19 +143,15 @@ class Robot:
         given = settings or BusConfig(robot=robot, connect=endpoints)
         self.name = given.robot
         self._session = open_client(given)
-        self._time = _RobotTime(self._session, self.name)
         self._declared: list[object] = []  # zenoh undeclares what nothing refers to any longer
+        # The robot's own time less this computer's monotonic clock, as late as its answer came, and when it was asked.
+        self._offset_ns: int | None = None
+        self._asked_s = -math.inf
 
     def close(self) -> None:
-        """End the connection; a second call does nothing."""
+        """End the connection."""
         with suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def subscribe(self, kind: type[T]) -> Subscription[T]:
         """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map, NavigationReport or Scan."""
@@ -187,8 +184,8 @@ class Robot:
 
         source: "operator" or "planner"; empty: the operator, who has priority.
         """
-        self._time.now_ns(waits=not self._time.is_known)
-        return Driver(self._session, self.name, self._time, source)
+        self.now_ns(waits=True)
+        return Driver(self, self._session, source)
 
     def query(self, name: str) -> str:
         """Return the robot's `config` or `rig`, both TOML; "" where it does not answer."""
@@ -210,38 +207,25 @@ class Robot:
         replies = self._session.liveliness().get(f"{self.name}/{ALIVE}", timeout=CONNECT_S)
         return any(reply.ok is not None for reply in replies)
 
-
-class _RobotTime:
-    """A robot's own time, which senders attach to what they send, so that no clock of theirs matters.
-
-    The robot is asked for it, at most once in CONNECT_S; in between it is followed by this computer's monotonic clock.
-    """
-
-    def __init__(self, session: zenoh.Session, robot: str) -> None:
-        self._session, self._key = session, f"{robot}/{topics.TIME}"
-        self._offset_ns: int | None = None  # the robot's time less ours, as late as its answer came
-        self._asked_s = -math.inf
-
-    @property
-    def is_known(self) -> bool:
-        """True once the robot has answered."""
-        return self._offset_ns is not None
-
     def now_ns(self, *, waits: bool = False) -> int:
-        """Return the robot's time, 0 where it is not known. waits: ask now, and wait for the answer of one there."""
-        if waits or time.monotonic() - self._asked_s > CONNECT_S:
-            self._asked_s = time.monotonic()
-            if waits:
-                for reply in self._session.get(self._key, timeout=CONNECT_S):
-                    self._set(reply)
-            else:
-                self._session.get(self._key, self._set, timeout=CONNECT_S)
-        return 0 if self._offset_ns is None else time.monotonic_ns() + self._offset_ns
+        """Return the robot's own time, which senders attach, so that no clock of theirs matters; 0: it is not known.
 
-    def _set(self, reply: zenoh.Reply) -> None:
-        with suppress(ValueError):
-            if reply.ok is not None:
-                self._offset_ns = int(reply.ok.payload.to_bytes()) - time.monotonic_ns()
+        The robot is asked for it, at most once in CONNECT_S. waits: ask now, and wait for the answer of one there.
+        """
+
+        def set_offset(reply: zenoh.Reply) -> None:
+            with suppress(ValueError):
+                if reply.ok is not None:
+                    self._offset_ns = int(reply.ok.payload.to_bytes()) - time.monotonic_ns()
+
+        if waits or time.monotonic() - self._asked_s > CONNECT_S:
+            self._asked_s, key = time.monotonic(), f"{self.name}/{topics.TIME}"
+            if waits:
+                for reply in self._session.get(key, timeout=CONNECT_S):
+                    set_offset(reply)
+            else:
+                self._session.get(key, set_offset, timeout=CONNECT_S)
+        return 0 if self._offset_ns is None else time.monotonic_ns() + self._offset_ns
 
 
 class Driver:
@@ -269,12 +253,12 @@ class Driver:
             driver.twist(0.0, 0.0)
     """
 
-    def __init__(self, session: zenoh.Session, robot: str, own_time: _RobotTime, source: str = "") -> None:
+    def __init__(self, robot: Robot, session: zenoh.Session, source: str = "") -> None:
         prefix = f"cmd/{source}" if source else "cmd"
-        self._session, self._robot, self._time = session, robot, own_time
+        self._robot, self._session, cdr = robot, session, zenoh.Encoding.APPLICATION_CDR
         self._twist, self._heading = f"{prefix}/{topics.TWIST}", f"{prefix}/{topics.HEADING}"
         self._publishers = {
-            topic: session.declare_publisher(f"{robot}/{topic}", encoding=zenoh.Encoding.APPLICATION_CDR, **_QUALITY)
+            topic: session.declare_publisher(f"{robot.name}/{topic}", encoding=cdr, **_QUALITY)
             for topic in (self._twist, self._heading, topics.STOP, topics.ARM)
         }
         self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
@@ -330,16 +314,16 @@ class Driver:
         payload_at: returns the CDR bytes for a time of sending [ns of Unix time]. Raise OmnidError where no robot takes
         such requests within CONNECT_S, or none answers.
         """
-        key = f"{self._robot}/{topics.request_key(topic)}"
+        key = f"{self._robot.name}/{topics.request_key(topic)}"
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
             self._require(querier, "takes such requests")
-            self._time.now_ns(waits=True)
+            self._robot.now_ns(waits=True)
             self.asked_ns = now_ns = time.time_ns()
             for reply in querier.get(payload=payload_at(now_ns), attachment=self._attached(now_ns)):
                 if reply.ok is not None and (answer := topics.answer_of(reply.ok.payload.to_bytes())) is not None:
                     return answer
         raise OmnidError(
-            f"{self._robot} has not answered: either this program must not command it (access_control in "
+            f"{self._robot.name} has not answered: either this program must not command it (access_control in "
             "zenoh's file of the robot or router), or it gives no poses; see `omnid listen`"
         )
 
@@ -351,7 +335,7 @@ class Driver:
     def _attached(self, sent_ns: int) -> bytes:
         """Return the attachment with the time of sending: by this computer's clock, and by the robot's own."""
         self._sent += 1
-        return ros2.attachment(self._sent, sent_ns, self._gid, self._time.now_ns())
+        return ros2.attachment(self._sent, sent_ns, self._gid, self._robot.now_ns())
 
     def _require(self, declared: zenoh.Publisher | zenoh.Querier, does: str) -> None:
         """Wait for a robot that takes what is sent. Raise OmnidError after CONNECT_S."""
@@ -359,7 +343,7 @@ class Driver:
         while not has_receiver(declared):
             if time.monotonic() > deadline_s:
                 raise OmnidError(
-                    f"no robot {self._robot!r} {does} there: check --robot and --connect, and that its daemon runs, "
-                    "with a motor where it is to drive"
+                    f"no robot {self._robot.name!r} {does} there: check --robot and --connect, and that its daemon "
+                    "runs, with a motor where it is to drive"
                 )
             time.sleep(PERIOD_S)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from typing import Annotated, Final, Literal
@@ -291,16 +291,12 @@ def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str
     return load(Config, path, overrides)
 
 
-# Keys and sections that only one of `omnid run` and `omnid replay` uses; the longest path counts. "": both use it.
+# Keys and sections that only one of `omnid run` and `omnid replay` uses.
 _RUN_ONLY: Final = (
-    *("bus.panorama_hz", "cameras", "controller.arming", "live", "places.save_s", "navigation"),
-    *("realtime", "record", "rig", "service"),
+    *("bus.panorama_hz.", "cameras.", "controller.arming.", "live.", "navigation.", "places.save_s.", "realtime."),
+    *("record.", "service."),
 )
-_USED_ONLY_BY: Final[Mapping[str, str]] = {
-    **dict.fromkeys(_RUN_ONLY, "run"),
-    **dict.fromkeys(("controller.setpoint", "log"), "replay"),
-    "rig.check": "",
-}
+_REPLAY_ONLY: Final = ("controller.setpoint.", "log.")
 
 
 def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> list[str]:
@@ -309,25 +305,18 @@ def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> l
     command: run or replay. Raises OmnidError for an override that the command ignores, and for a setpoint in `run`:
     a robot must not be expected to drive by itself.
     """
+    others = _REPLAY_ONLY if command == "run" else _RUN_ONLY
     for override in overrides:
         path = ".".join(part.strip() for part in override.partition("=")[0].split("."))
-        if _ignores(command, path):
+        if f"{path}.".startswith(others):
             raise OmnidError(f"override {override!r}: `omnid {command}` does not use {path}: leave it out")
-    ignored = [path for path in changed(config) if _ignores(command, path)]
-    if command == "run":
-        for path in ignored:
-            if path.startswith("controller.setpoint."):
-                raise OmnidError(
-                    f"{path} is set, but `omnid run` drives by the setpoints that it receives, as "
-                    "cmd/twist or cmd/heading: remove it from the configuration"
-                )
+    ignored = [path for path in changed(config) if f"{path}.".startswith(others)]
+    if setpoint := [path for path in ignored if path.startswith("controller.setpoint.")]:
+        raise OmnidError(
+            f"{setpoint[0]} is set, but `omnid run` drives by the setpoints that it receives, as cmd/twist or "
+            "cmd/heading: remove it from the configuration"
+        )
     return [f"`omnid {command}` does not use these settings: {', '.join(ignored)}"] if ignored else []
-
-
-def _ignores(command: str, path: str) -> bool:
-    """True if only the other command uses the key."""
-    longest = max((name for name in _USED_ONLY_BY if f"{path}.".startswith(f"{name}.")), key=len, default="")
-    return _USED_ONLY_BY.get(longest, "") not in ("", command)
 
 
 # The settings that a new robot may need, in `omnid config --minimal`.

@@ -6,9 +6,7 @@ names its dotted path.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
 from functools import reduce
 from os import PathLike
 from typing import Any, Final, TypeVar, get_args
@@ -18,11 +16,11 @@ from calib.typed_toml import (
     bytes_of,
     convert,
     described,
-    dotted,
     is_section,
     key_paths,
     shown,
     table_of,
+    toml_value,
     types_of,
 )
 from omnid.errors import OmnidError
@@ -47,25 +45,20 @@ def load(root: type[T], path: str | PathLike[str] | None = None, overrides: Sequ
 
 def parse(root: type[T], data: bytes, *, origin: str, overrides: Sequence[str] = ()) -> T:
     """Return the settings of TOML bytes that were read from `origin`; the rest is as in `load`."""
-    changes = [_change(root, text) for text in ([overrides] if isinstance(overrides, str) else overrides)]
+    changes = [_override(root, text) for text in ([overrides] if isinstance(overrides, str) else overrides)]
     try:
         table = table_of(data)
-        for path, value in changes:
-            _insert(table, path, value)
+        for change in changes:
+            _merge(table, change)
         return convert(root, table)
-    except (ValueError, OmnidError) as error:
+    except ValueError as error:
         raise OmnidError(f"{origin}: {error}") from None
 
 
 def changed(settings: object) -> list[str]:
     """Return the dotted paths of the keys that differ from their defaults."""
-    default = type(settings)()
-    return [path for path in paths_of(type(settings)) if value_at(settings, path) != value_at(default, path)]
-
-
-def paths_of(root: type) -> list[str]:
-    """Return the dotted paths of all keys."""
-    return [".".join(path) for path in key_paths(root)]
+    paths, default = map(".".join, key_paths(type(settings))), type(settings)()
+    return [path for path in paths if value_at(settings, path) != value_at(default, path)]
 
 
 def value_at(settings: object, path: str) -> object:
@@ -83,29 +76,24 @@ def dump(settings: object, wanted: Collection[str] | None = None) -> str:
     return "\n".join(_lines(settings, type(settings)(), (), chosen)).strip("\n") + "\n"
 
 
-def _change(root: type, text: str) -> tuple[Path, object]:
-    """Return the path and the value of an override, which is checked by itself."""
-
-    def check(value: object) -> object:
-        table: dict[str, Any] = {}
-        _insert(table, path, value)
-        convert(root, table)
-        return value
-
-    name, equals, raw = text.partition("=")
-    path, raw = tuple(part.strip() for part in name.split(".")), raw.strip()
+def _override(root: type, text: str) -> dict[str, Any]:
+    """Return the table of an override, which is checked by itself."""
+    name, equals, raw = (part.strip() for part in text.partition("="))
+    errors = list[ValueError]()
     try:
         if not equals:
             raise ValueError("expected section.key=value, found no '='")
-        if not raw.isprintable() and any("\ud800" <= letter <= "\udfff" for letter in raw):
-            raise ValueError(f"{dotted(path)}: expected UTF-8, found {shown(raw)}")
-        try:
-            return path, check(_scalar(raw))
-        except ValueError as error:
-            with suppress(ValueError):
-                return path, check(raw)  # a text needs no quotes around it
-            raise error
-    except (ValueError, OmnidError) as error:
+        if any("\ud800" <= letter <= "\udfff" for letter in raw):
+            raise ValueError(f"{name}: expected UTF-8, found {shown(raw)}")
+        for value in (_scalar(raw), raw):  # a text needs no quotes around it
+            table: Any = reduce(lambda below, part: {part.strip(): below}, reversed(name.split(".")), value)
+            try:
+                convert(root, table)
+                return dict(table)
+            except ValueError as error:
+                errors.append(error)
+        raise errors[0]
+    except ValueError as error:
         raise OmnidError(f"override {shown(text)}: {error}") from None
 
 
@@ -118,13 +106,13 @@ def _scalar(raw: str) -> object:
     return table["value"] if table.keys() == {"value"} else raw
 
 
-def _insert(table: dict[str, Any], path: Path, value: object) -> None:
-    """Set a value in nested tables. Raise ValueError where a section would replace a value."""
-    for depth, name in enumerate(path[:-1]):
-        table = table.setdefault(name, {})
-        if not isinstance(table, dict):
-            raise ValueError(f"{dotted(path[: depth + 1])}: expected a section, found {shown(table)}")
-    table[path[-1]] = value
+def _merge(table: dict[str, Any], change: dict[str, Any]) -> None:
+    """Set the values of a table of changes in another one."""
+    for name, value in change.items():
+        if isinstance(value, dict) and isinstance(table.get(name), dict):
+            _merge(table[name], value)
+        else:
+            table[name] = value
 
 
 def _lines(settings: Any, default: Any, path: Path, wanted: Collection[str] | None) -> Iterator[str]:
@@ -139,23 +127,12 @@ def _lines(settings: Any, default: Any, path: Path, wanted: Collection[str] | No
         value, usual = getattr(settings, name), getattr(default, name)
         lines.append(f"# {next(found for found in get_args(kind)[1:] if isinstance(found, str))}")
         if wanted is None:
-            lines.append(f"# {described(kind)}; default {_toml(usual)}")
+            lines.append(f"# {described(kind)}; default {toml_value(usual)}")
         is_off = wanted is not None and value == usual
-        lines.append(f"{'# ' if is_off else ''}{name} = {_toml(value)}")
+        lines.append(f"{'# ' if is_off else ''}{name} = {toml_value(value)}")
     if lines and path:
         yield from ("", f"[{'.'.join(path)}]")
     yield from lines
     for name, kind in types.items():
         if is_section(kind):
             yield from _lines(getattr(settings, name), getattr(default, name), (*path, name), wanted)
-
-
-def _toml(value: object) -> str:
-    """Return a bool, number, text or tuple as a TOML value."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_toml(element) for element in value) + "]"
-    if isinstance(value, str):  # JSON's escapes are TOML's, except that TOML wants DEL escaped as well
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)

@@ -9,9 +9,10 @@ from typing import Annotated, Literal
 import pytest
 from msgspec import Meta
 
+from calib.typed_toml import key_paths
 from omnid.config import FIRST_SETTINGS, Config, load_config, unused_settings
 from omnid.errors import OmnidError
-from omnid.settings import dump, load, parse, paths_of
+from omnid.settings import dump, load, parse
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +146,7 @@ SHIPPED = Path(__file__).parents[2] / "systemd" / "omnid.toml"
 def test_the_shipped_configuration_is_the_default() -> None:
     assert load_config(SHIPPED) == Config()
     assert SHIPPED.read_text() == dump(Config(), FIRST_SETTINGS), "run `omnid config --minimal`"
-    assert set(FIRST_SETTINGS) <= set(paths_of(Config))
+    assert set(FIRST_SETTINGS) <= set(map(".".join, key_paths(Config)))
 
 
 @pytest.mark.parametrize(
