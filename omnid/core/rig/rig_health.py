@@ -245,15 +245,16 @@ class RigHealth:
         """One line about a rig that the images contradict, or could not check, and what to do; else empty."""
         if (finding := self.finding) is None:
             return ""
-        calibrate = "`omnid calibrate drive` on a recording of driving"
         words = {
             RigState.EXCHANGED: "the images match better the other way round: exchange --lower and --upper, or the "
             "cameras in the configuration; if that does not help, the rig is that of other cameras",
             RigState.BROKEN: "the images contradict the rig: a camera is covered, or the upper one is turned by "
-            f"{finding.turn_deg:.1f} deg by {finding.matches} points: give its own rig, or use {calibrate}",
+            f"{finding.turn_deg:.1f} deg by {finding.matches} points: give its own rig, or "
+            "calibrate it: `omnid calibrate drive --only check` shows by how much it is off",
             RigState.UNCHECKED: "the rig could not be checked by the images: too few points are seen by both cameras; "
             "are they dark, covered or unsharp?",
-            RigState.DRIFTED: f"the images do not quite fit the rig, {finding.summary}: use {calibrate}",
+            RigState.DRIFTED: f"the images do not quite fit the rig, {finding.summary}: run `omnid calibrate "
+            "drive` on a recording of driving",
         }
         return words.get(self.state, "")
 
