@@ -49,8 +49,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-RULER_SIGMA_M: Final = 0.01  # Standard deviation of a height by ruler: the viewpoint is inside of the mirror.
-AGREED_SIGMAS: Final = 3.0
+LEANING_SIGMAS: Final = 3.0  # Smaller tilts are not written, because they may be errors of the estimate.
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,18 +67,6 @@ class HeightCalibration:
             f"height of the lower viewpoint {floor.height_m:.3f} m (sigma {floor.sigma_m:.3f}), tilt "
             f"{math.degrees(floor.tilt_rad):.2f} deg (sigma {math.degrees(floor.sigma_rad):.2f}), by the floor in "
             f"{self.pairs} pairs"
-        )
-
-    def contradiction(self, ruler_m: float) -> str:
-        """Return a warning where a height by ruler differs; empty where both agree."""
-        limit_m = AGREED_SIGMAS * math.hypot(self.floor.sigma_m, RULER_SIGMA_M)
-        if abs(ruler_m - self.floor.height_m) <= limit_m:
-            return ""
-        baseline_mm = 1e3 * self.rig.baseline_m * ruler_m / self.floor.height_m
-        return (
-            f"{ruler_m:.3f} m by ruler, {self.floor.height_m:.3f} m by the floor: they differ by more than "
-            f"{limit_m:.3f} m; measure from the floor to the focus of the lower mirror; if that is right, the "
-            f"baseline is wrong: {1e3 * self.rig.baseline_m:.1f} mm in the rig, {baseline_mm:.1f} mm would fit"
         )
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -116,8 +103,7 @@ def calibrate_height(
 
 def on_floor(rig: Rig, floor: Floor) -> Rig:
     """Return the rig with its base on the floor, levelled where the tilt is more than its noise."""
-    # Smaller tilts are not written, because they may be errors of the estimate.
-    if floor.tilt_rad < AGREED_SIGMAS * floor.sigma_rad:
+    if floor.tilt_rad < LEANING_SIGMAS * floor.sigma_rad:
         floor = floor._replace(a=0.0, b=0.0)
     view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]
     return replace(rig, T_base_rig=floor.T_floor_base(view) @ rig.T_base_rig)

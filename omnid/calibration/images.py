@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,12 +43,7 @@ class PairedImages:
 
 
 def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
-    """Read the images of a folder or a log. Raises OmnidError without any pair.
-
-    An instant whose images have all pixels of those of an earlier one is left out: it is no further view of a board,
-    and would count the same errors again.
-    """
-    # 1. Read the images of both cameras.
+    """Read the images of a folder or a log. Raises OmnidError without any pair."""
     is_log = is_log_name(source.name)
     if source.is_dir():  # a folder of a log's files, or of folders of images, one for each camera
         has_folders = not any(source.glob(f"{SIDES[0]}_*")) and len(image_folders(source)) > 1
@@ -73,11 +67,7 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
         if is_log:
             expected = f"images whose stamps differ by less than {TOLERANCE_NS // 10**6} ms"
         raise OmnidError("; ".join([f"{source}: no pair of images: expected {expected}", *faults]))
-    # 2. Leave out those that repeat an earlier instant.
-    repeated = _repeats(sides)
-    kept = [{name: image for name, image in side.items() if name not in repeated} for side in sides]
-    notes = tuple(f"left out {name}: the same image as {earlier}" for name, earlier in repeated.items())
-    return PairedImages((kept[0], kept[1]), topics, (*faults, *notes))
+    return PairedImages(sides, topics, tuple(faults))
 
 
 def _of_log(reader: LogReader, faults: list[str]) -> tuple[Images, Images]:
@@ -98,17 +88,6 @@ def _of_log(reader: LogReader, faults: list[str]) -> tuple[Images, Images]:
     if left_out:
         faults.append(f"left out {len(left_out)} pairs; the first: {left_out[0]}")
     return lower, upper
-
-
-def _repeats(sides: Sequence[Images]) -> dict[str, str]:
-    """Return the instants whose images have all pixels of those of an earlier one: name -> the earlier name."""
-    first, found = dict[tuple[bytes, ...], str](), dict[str, str]()
-    for name in sorted({name for side in sides for name in side}):
-        key = tuple(hashlib.sha256(side[name].tobytes()).digest() if name in side else b"" for side in sides)
-        earlier = first.setdefault(key, name)
-        if earlier != name:
-            found[name] = earlier
-    return found
 
 
 def _of_side(folder: Path, side: str, bits: int) -> Images:

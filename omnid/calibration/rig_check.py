@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from calib.fit.least_squares import ROUNDS
-from calib.fit.rig_drift import SHIFT_SIGMA_RAD, apply_drift
+from calib.fit.rig_drift import SHIFT_SIGMA_RAD
 from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import TOLERANCE_NS, spread_pairs
@@ -35,10 +34,6 @@ PAIRS: Final = 24
 # Median time between the exposures of the pairs: the stamps of cameras that are triggered together scatter by less.
 MAX_SKEW_S: Final = 3e-3
 RECALIBRATE = "the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board"
-NOT_OBSERVABLE = (
-    "not observable without a board: the length of the baseline (kept), the cameras' intrinsics, and the "
-    "rig's pose on the robot"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,29 +53,21 @@ class RigCheckResult:
 
     def __str__(self) -> str:
         """Return the result as lines of text, the condition first."""
-        finding = self.finding
-        lines = [
-            f"{finding.state}: {self.pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
-        ]
-        if (drift := finding.drift) is not None:
-            turn, turn_sigma = np.rad2deg(drift.turn), np.rad2deg(drift.turn_sigma)
-            shift, shift_sigma = np.rad2deg(drift.shift), np.rad2deg(drift.shift_sigma)
-            about = zip(turn, turn_sigma, "xyz", strict=True)
-            along = zip(shift, shift_sigma, "xy", strict=True)
-            rotation = ", ".join(f"{value:+.3f} ({sigma:.3f}) about {axis}" for value, sigma, axis in about)
-            translation = ", ".join(f"{value:+.2f} ({sigma:.2f}) along {axis}" for value, sigma, axis in along)
+        finding, drift = self.finding, self.finding.drift
+        lines = [f"{finding.summary}, in {self.pairs} pairs"]
+        if drift is not None:
+            along = zip(np.rad2deg(drift.shift), np.rad2deg(drift.shift_sigma), "xy", strict=True)
+            shift = ", ".join(f"{value:+.2f} ({sigma:.2f}) along {axis}" for value, sigma, axis in along)
             lines += [
-                f"upper camera: rotated by {finding.turn_deg:.3f} deg, sigma {np.rad2deg(drift.angle_sigma):.3f}: "
-                f"{rotation}; z is along the baseline",
-                f"upper viewpoint: shifted by {translation} deg, as seen from the lower one",
+                f"upper viewpoint: shifted by {shift} deg, as seen from the lower one",
                 f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
+                *[RECALIBRATE] * self.has_changed_intrinsics,
             ]
-            lines += [RECALIBRATE] * self.has_changed_intrinsics
         return "\n".join(lines)
 
 
-def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult, list[FramePair]]:
-    """Check a rig by pairs spread over a log; return them as well. OmnidError where they show too little."""
+def check_log(log: Path, rig: Rig, cameras: LogCameras) -> RigCheckResult:
+    """Check a rig by pairs spread over a log; OmnidError where they show too little."""
     pairs = read_rig_pairs(log, rig, cameras)
     found = check_rig(pairs, rig, Config().panorama)
     if abs(found.skew_s) >= MAX_SKEW_S:
@@ -94,23 +81,7 @@ def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult,
             f"calibrate drive: expected at least {MIN_MATCHES} points in both panoramas, found "
             f"{found.finding.matches} of {found.finding.tried} in {len(pairs)} pairs; use a log with more texture"
         )
-    return found, pairs
-
-
-def with_upper_corrected(rig: Rig, pairs: Sequence[FramePair], found: RigCheckResult) -> tuple[Rig, str]:
-    """Return the rig whose upper camera's pose is corrected by the drift that was found, and what remains, in words."""
-    is_doubtful = found.has_changed_intrinsics
-    # Each correction finds more points than the one before, as more of them match.
-    for _ in range(ROUNDS):
-        if found.finding.drift is None:
-            raise OmnidError("calibrate drive: too few points match to correct the rig; calibrate it with a board")
-        rig = apply_drift(rig, found.finding.drift)
-        found = check_rig(pairs, rig, Config().panorama)
-        sigma_rad = 0.0 if found.finding.drift is None else np.linalg.norm(found.finding.drift.turn_sigma)
-        if found.finding.turn_deg < 2 * np.rad2deg(sigma_rad):
-            break
-    is_doubtful |= found.finding.state is not RigState.FITS
-    return rig, "\n".join([found.finding.summary, NOT_OBSERVABLE, *[RECALIBRATE] * is_doubtful])
+    return found
 
 
 def read_rig_pairs(log: Path, rig: Rig, cameras: LogCameras) -> list[FramePair]:

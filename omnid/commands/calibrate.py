@@ -28,7 +28,7 @@ from omnid.calibration.from_log import calibrate_height, calibrate_mask
 from omnid.calibration.images import SIDES, read_pairs
 from omnid.calibration.live_boards import LiveBoards, newest_pairs, status
 from omnid.calibration.rig import calibrate_rig
-from omnid.calibration.rig_check import check_log, with_upper_corrected
+from omnid.calibration.rig_check import check_log
 from omnid.commands import options
 from omnid.core.rig.rig_health import RigState
 from omnid.engine.kernel_cache import prepare_kernels
@@ -170,16 +170,15 @@ def drive(args: argparse.Namespace) -> int:
     logs LOG...        drives with turns; 100 to 350 pairs
     --rig FILE         the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images,
         baseline by ruler; default: the one attached to the first log
-    --only check|height|mask...  only this, by the first log; may be repeated. check: compare the rig with the images,
-        and correct the upper camera's pose; height: height and tilt of the cameras by the floor; mask: hide what is
-        fixed to the cameras, by a log in which the robot turns once
-    --ruler-m M 0.1..10     the height by ruler, as a check of that by the floor
+    --only check|height|mask...  only this, by the first log; may be repeated. check: compare the rig with the images;
+        height: height and tilt of the cameras by the floor; mask: hide what is fixed to the cameras, by a log in which
+        the robot turns once
     -o, --output FILE  the rig.toml to write; may be the file of --rig
 
     examples:
       calibrate drive drive.mcap --rig rig.toml -o better.toml
       calibrate drive drive.mcap --only check
-      calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml
+      calibrate drive drive.mcap --only height --rig rig.toml -o rig.toml
     """
     # 1. The rig to start from.
     if args.output is not None:
@@ -193,12 +192,9 @@ def drive(args: argparse.Namespace) -> int:
     # 2. Check the rig, or adjust all of it.
     rig, has_drifted, topics = start, False, log_cameras(args)
     if "check" in args.only:
-        checked, pairs = check_log(args.logs[0], rig, topics)
+        checked = check_log(args.logs[0], rig, topics)
         print(checked)
         has_drifted = checked.finding.state is not RigState.FITS
-        if args.output is not None:
-            rig, remains = with_upper_corrected(rig, pairs, checked)
-            print(f"{args.output}: {remains}")
     elif not args.only:
         adjusted = calibrate_drive(args.logs, rig, topics, lambda line: print(line, file=sys.stderr))
         print("\n".join(adjusted.lines()))
@@ -229,13 +225,13 @@ def drive(args: argparse.Namespace) -> int:
 
 
 def _at_height(args: argparse.Namespace, rig: Rig) -> Rig:
-    """Return the rig with the height that is given, or else by the floor. Raise OmnidError where the ruler contradicts.
+    """Return the rig with the height that is given, or else by the floor.
 
     Without --only, a height that the rig states is kept, and a floor that is not seen is no error.
     """
     if args.height_m is not None:
         return rig.at_height(args.height_m)
-    is_wanted = args.ruler_m is not None or "height" in args.only
+    is_wanted = "height" in args.only
     if not is_wanted and (args.only or rig.height_m() is not None):
         return rig
     try:
@@ -247,10 +243,6 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> Rig:
         return rig
     print(found)
     print(f"the rig so far: {height_of(rig)}")
-    if args.ruler_m is not None:
-        if contradiction := found.contradiction(args.ruler_m):
-            raise OmnidError(f"{contradiction}; nothing was written")
-        print(f"{args.ruler_m:.3f} m by ruler agrees")
     return found.rig
 
 

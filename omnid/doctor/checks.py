@@ -158,7 +158,7 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
             yield Finding("error", "rig", other, "set cameras.width_px and height_px")
     if (height_m := found.height_m(floor_m)) is None:
         unknown = f"{path} does not state the height of the cameras: nothing is free until the images show the floor"
-        advice = "state it by `omnid calibrate drive LOG --only height`, with --ruler-m as a check"
+        advice = "state it by `omnid calibrate drive LOG --only height`"
         yield Finding("warning", "rig", unknown, advice)
     else:
         good = f"{path}, {found.baseline_m:.3f} m between the viewpoints, {height_m:.3f} m above the floor"

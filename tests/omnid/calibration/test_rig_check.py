@@ -1,4 +1,4 @@
-"""`omnid calibrate drive --only check` on rendered logs: right, drifted and broken rigs, correction of the drift."""
+"""`omnid calibrate drive --only check` on rendered logs: right, drifted and broken rigs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import se3
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.images import BY_NAME
@@ -48,17 +47,12 @@ def check_rotated(drive: Path, pairs: list[FramePair], turn_deg: Turn) -> RigChe
     return check_rig(pairs, with_upper_rotated(read_rig(drive / "rig.toml"), turn_deg), PanoramaConfig())
 
 
-def test_motion_between_the_exposures_is_no_drift_to_correct(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_motion_between_the_exposures_is_no_drift(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = build("two_walls", 3, 256, 8)
     write_log(tmp_path, drive.rig, drive.poses, drive.scene, readout=Readout(skew_ms=(-20.0, -20.0)), supersample=1)
     words = (tmp_path / "log.mcap", "--rig", tmp_path / "rig.toml")
-    assert run(*words, "-o", tmp_path / "new.toml") == 2
-    assert (
-        "without --only the times of exposure are calibrated" in capsys.readouterr().err
-        and not (tmp_path / "new.toml").exists()
-    )
+    assert run(*words) == 2
+    assert "without --only the times of exposure are calibrated" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -89,22 +83,13 @@ def run(*words: object) -> int:
     return main(["calibrate", "drive", *map(str, words), "--only", "check"])
 
 
-def test_command_reports_and_corrects_a_drift(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log, wrong, right = drive / "log.mcap", tmp_path / "wrong.toml", tmp_path / "right.toml"
-    truth = read_rig(drive / "rig.toml")
-    write_rig(wrong, with_upper_rotated(truth, (0.6, -0.4, 1.5)))
+def test_command_reports_a_drift(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, wrong = drive / "log.mcap", tmp_path / "wrong.toml"
+    write_rig(wrong, with_upper_rotated(read_rig(drive / "rig.toml"), (0.6, -0.4, 1.5)))
     assert run(log, "--rig", drive / "rig.toml") == 0
     assert capsys.readouterr().out.startswith("fits: ")
-    assert run(log, "--rig", wrong, "-o", right) == 1
-    output = capsys.readouterr().out
-    assert output.startswith("drifted: ")
-    assert "rotated by 1.6" in output and "about z" in output
-    assert "not observable without a board: the length of the baseline" in output
-    again = read_rig(right)
-    gap = again.upper.T_cam_rig @ se3.inverse(truth.upper.T_cam_rig)
-    assert np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))) < 0.06
-    assert again.baseline_m == pytest.approx(truth.baseline_m, abs=1e-9)
-    assert run(log, "--rig", right) == 0
+    assert run(log, "--rig", wrong) == 1
+    assert capsys.readouterr().out.startswith("drifted: upper camera turned by 1.6")
 
 
 def test_recommends_recalibration_for_a_shifted_centre(
