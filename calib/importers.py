@@ -81,14 +81,6 @@ class KalibrCamera(msgspec.Struct, frozen=True):
         return camera_of(model, values, self.resolution)
 
 
-def import_chain(path: Path, lower: str = "", upper: str = "", frame: str = "imu", warn: Warn = silent) -> Rig:
-    """Read the rig of a camchain.yaml; lower and upper: names of cameras (cam0), instead of topic or height.
-
-    frame: "imu": T_cam_imu is taken for T_cam_rig; "cameras": the rig frame is that of rig_between.
-    """
-    return parse_chain(read_text(path), str(path), lower, upper, frame, warn)
-
-
 def parse_chain(
     text: str,
     name: str = "camchain.yaml",
@@ -97,7 +89,11 @@ def parse_chain(
     frame: str = "imu",
     warn: Warn = silent,
 ) -> Rig:
-    """Parse the rig of a file's text; warn: takes lines about what had to be assumed."""
+    """Parse the rig of a camchain.yaml's text; lower and upper: names of cameras (cam0), instead of topic or height.
+
+    frame: "imu": T_cam_imu is taken for T_cam_rig; "cameras": the rig frame is that of rig_between. warn: takes lines
+    about what had to be assumed.
+    """
 
     def warn_of_file(line: str) -> None:
         warn(f"{name}: {line}")

@@ -113,18 +113,6 @@ class Cylinder:
         return np.asarray((self.width == self.turn_px) | ((columns >= 0) & (columns <= self.width - 1)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Sector:
-    """Azimuths that both cameras share: from right_rad on, turning left; the whole circle has a span of 2 pi."""
-
-    right_rad: float
-    span_rad: float
-
-    @property
-    def is_full(self) -> bool:
-        return self.span_rad == 2 * math.pi
-
-
 def fit_cylinder(
     rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0), scale: float = 1.0
 ) -> Cylinder:
@@ -133,9 +121,9 @@ def fit_cylinder(
     width_px: columns of a full turn; 0: the resolution of the images, scaled.
     """
     # 1. The sector of azimuth, and the slopes, that both cameras see.
-    sector, slopes = _shared_view(rig, elevation_deg)
+    right_rad, span_rad, slopes = _shared_view(rig, elevation_deg)
     # 2. Columns.
-    own_px, turn = _turn_px(rig, sector, float(np.clip(0.0, slopes.min(), slopes.max()))), width_px
+    own_px, turn = _turn_px(rig, right_rad, span_rad, float(np.clip(0.0, slopes.min(), slopes.max()))), width_px
     if turn:
         scale = turn / own_px if math.isfinite(own_px) else 1.0
     elif math.isfinite(own_px):
@@ -143,11 +131,11 @@ def fit_cylinder(
     else:
         raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
     width, first = turn, 0
-    if not sector.is_full:
+    if span_rad < math.tau:
         step = max(1, round(turn / SECTOR_STEPS))
         turn, step_rad = step * SECTOR_STEPS, 2 * math.pi / SECTOR_STEPS
-        left = math.floor((math.pi - sector.right_rad - sector.span_rad) / step_rad)
-        right = math.ceil((math.pi - sector.right_rad) / step_rad)
+        left = math.floor((math.pi - right_rad - span_rad) / step_rad)
+        right = math.ceil((math.pi - right_rad) / step_rad)
         width, first = step * min(right - left, SECTOR_STEPS), step * (left % SECTOR_STEPS)
     if width > MAX_WIDTH_PX:
         raise _too_large(f"{width} columns")
@@ -172,10 +160,11 @@ def _too_large(found: str) -> CalibError:
     )
 
 
-def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[_Sector, Array]:
+def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[float, float, Array]:
     """Return the sector that both cameras share, and the slopes z/r (S,) that both see over most of it.
 
-    Raise CalibError where they share too little.
+    The sector begins at an azimuth and turns left by its span [rad]; that of the whole circle is 2 pi. Raise CalibError
+    where the cameras share too little.
     """
     low, high = np.tan(np.deg2rad(elevation_deg))
     slopes: Array = np.linspace(low, high, SLOPES)
@@ -185,15 +174,15 @@ def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[_Sector,
             f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
             "of elevation; check the intrinsics, the transforms and the masks"
         )
-    first = 0.0 if sector.is_full else 0.5
-    azimuths = sector.right_rad + (np.arange(AZIMUTHS) + first) * sector.span_rad / AZIMUTHS
+    right_rad, span_rad = sector
+    azimuths = right_rad + (np.arange(AZIMUTHS) + (0.5 if span_rad < math.tau else 0.0)) * span_rad / AZIMUTHS
     lower, upper = (
         _seen(rig, mounted, slopes, azimuths).mean(axis=1) >= MIN_VISIBLE for mounted in (rig.lower, rig.upper)
     )
     slopes = slopes[lower & upper]
     if not len(slopes):
         raise CalibError(
-            f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no elevation between "
+            f"rig: the cameras share {math.degrees(span_rad):.0f} degrees of azimuth, but no elevation between "
             f"{elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check the transforms and the masks"
         )
     shared_deg = math.degrees(math.atan(slopes.max()) - math.atan(slopes.min()))
@@ -203,11 +192,11 @@ def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[_Sector,
             f"viewpoints, expected {MIN_SHARED_DEG:g} or more: lenses back to back share too little; "
             "check the transforms and the masks"
         )
-    return sector, slopes
+    return right_rad, span_rad, slopes
 
 
-def _shared_sector(rig: Rig, slopes: Array) -> _Sector | None:
-    """Return the azimuths at which both cameras see a slope; None where there is none.
+def _shared_sector(rig: Rig, slopes: Array) -> tuple[float, float] | None:
+    """Return begin and span of the azimuths at which both cameras see a slope; None where there is none.
 
     It is the complement of the widest gap, or the whole circle if no gap is as wide as MIN_UNSEEN_RAD.
     """
@@ -221,9 +210,9 @@ def _shared_sector(rig: Rig, slopes: Array) -> _Sector | None:
     gaps = np.diff(np.append(seen, seen[0] + SECTOR_GRID)) - 1
     widest = int(gaps.argmax())
     if gaps[widest] * step_rad < MIN_UNSEEN_RAD:
-        return _Sector(-math.pi, 2 * math.pi)
+        return -math.pi, math.tau
     right = int(seen[(widest + 1) % len(seen)])
-    return _Sector(right * step_rad - math.pi, (SECTOR_GRID - int(gaps[widest])) * step_rad)
+    return right * step_rad - math.pi, (SECTOR_GRID - int(gaps[widest])) * step_rad
 
 
 def _seen(rig: Rig, mounted: MountedCamera, slopes: Array, azimuth: Array) -> NDArray[np.bool_]:
@@ -236,20 +225,21 @@ def _seen(rig: Rig, mounted: MountedCamera, slopes: Array, azimuth: Array) -> ND
     return np.asarray(seen.reshape(len(slopes), -1))
 
 
-def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
+def _turn_px(rig: Rig, right_rad: float, span_rad: float, slope: float) -> float:
     """Return the length [px] of a full turn in the images, from that of the sector at a slope, in the coarser camera.
 
     That of a full circle is the length of the horizon; NaN where a camera does not see it.
     """
-    azimuth = sector.right_rad + np.linspace(0, sector.span_rad, 361)
-    ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full_like(azimuth, 0.0 if sector.is_full else slope)])
+    azimuth = right_rad + np.linspace(0, span_rad, 361)
+    level = np.full_like(azimuth, slope if span_rad < math.tau else 0.0)
+    ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), level])
     with np.errstate(over="ignore", invalid="ignore"):
         around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1) for m in (rig.lower, rig.upper)]
     # At the ends of a sector one of the cameras may have no image, and a stitched image has its ends somewhere on the
     # horizon: the median step stands for those.
     usual = [float(np.nanmedian(steps)) if np.isfinite(steps).any() else math.nan for steps in around]
     lengths = [
-        np.where(steps < MAX_STEP_RATIO * step, steps, step).sum() * 2 * math.pi / sector.span_rad
+        np.where(steps < MAX_STEP_RATIO * step, steps, step).sum() * math.tau / span_rad
         for steps, step in zip(around, usual, strict=True)
     ]
     sees_all = np.isfinite(lengths).all() and min(lengths) >= MIN_HORIZON_PX

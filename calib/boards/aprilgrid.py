@@ -1,4 +1,4 @@
-"""AprilTag grids as Kalibr prints them, and their detection in mirror images: any visible part of a grid counts.
+"""Detection of AprilTag grids in mirror images: any visible part of a grid counts.
 
 The tags' borders are two bits wide, and black squares between the tags turn the tags' corners into corners of a
 checkerboard. The tags that can be read predict the corners around them, to second order; these are found as saddle
@@ -7,24 +7,19 @@ points of grey, also those of tags that could not be read.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from calib.boards.board import MAX_SQUARE_M, MIN_SQUARE_M, BoardView
+from calib.boards.board import TAG_BORDER_BITS, AprilGrid, BoardView
 from calib.boards.corner_candidates import BLUR_PX, DerivedImage, Grey, Image, derived_images, smoothed
 from calib.boards.corner_grid import shown_corners
 from calib.boards.local_mapping import REACH, local_mapping, refined_corners, without_outliers
-from calib.errors import CalibError
 from calib.models.camera import Array
 
 # Corners (4, 2) [px] of tags by number, in the order of cv2.aruco.
 Tags = dict[int, Array]
-# Tags as in Kalibr: number of those of the family 36h11, width of the border [bits], bits along a side within it.
-TAGS, TAG_BORDER_BITS, TAG_BITS = 587, 2, 6
 
 
 # Least perimeter of a tag as a fraction of the image's larger side, and pixels per bit when it is read: half and 1.5 of
@@ -44,64 +39,6 @@ MIN_QUALITY = 0.6
 # Least number of corners, and how far they lie off one line (ratio of the standard deviations), because fewer, or those
 # of a line, determine no pose well.
 MIN_CORNERS, MIN_SPREAD = 8, 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class AprilGrid:
-    """A grid of columns x rows AprilTags 36h11 of tag_m, spacing times tag_m apart, as Kalibr prints it.
-
-    The numbers of the tags rise along x, then along y, from 0. Kalibr's frame: x right, y up, origin at the lower left
-    corner of tag 0.
-    """
-
-    columns: int
-    rows: int
-    tag_m: float
-    spacing: float
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.columns * self.rows <= TAGS:
-            raise CalibError(
-                f"board: expected 1 to {TAGS} tags, as the family 36h11 has, found {self.columns}x{self.rows}"
-            )
-        if not MIN_SQUARE_M <= self.tag_m <= MAX_SQUARE_M:
-            raise CalibError(f"board: expected tags of 0.1 mm to 10 m, found {self.tag_m * 1e3:g} mm")
-        if not 0 < self.spacing <= 1:
-            raise CalibError(
-                "board: expected a space between tags of at most a tag's side, like Kalibr's tagSpacing, found "
-                f"{self.spacing:g}"
-            )
-
-    @property
-    def square_m(self) -> float:
-        """Return the side of a tag [m], the unit of the windows about corners."""
-        return self.tag_m
-
-    @property
-    def points(self) -> Array:
-        """Return the corners of all tags (N, 3) [m], row by row upwards, z 0."""
-        x, y = np.meshgrid(self._ends(self.columns), self._ends(self.rows))
-        return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.tag_m)
-
-    @property
-    def window(self) -> float:
-        """Return the half side, in tags, of a window about a tag's corner: its border, the square beside it."""
-        return min(self.spacing, TAG_BORDER_BITS / (TAG_BITS + 2 * TAG_BORDER_BITS))
-
-    @property
-    def tag_corners(self) -> Array:
-        """Return the corners (M, 4, 2) [m] of the tags in the order of cv2.aruco."""
-        y, x = np.divmod(np.arange(self.columns * self.rows), self.columns)
-        # Clockwise from the upper left of the tag in OpenCV's dictionary, which is turned by half a turn as Kalibr
-        # prints it.
-        corner = np.array([[1, 0], [0, 0], [0, 1], [1, 1]])
-        return np.asarray((np.column_stack([x, y])[:, None] * (1 + self.spacing) + corner) * self.tag_m)
-
-    def __str__(self) -> str:
-        return f"AprilTag grid of {self.columns}x{self.rows} tags"
-
-    def _ends(self, tags: int) -> Array:
-        return np.asarray((np.arange(tags)[:, None] * (1 + self.spacing) + [0, 1]).ravel())
 
 
 def find_april_grid(image: Image, board: AprilGrid, name: str = "", *, thorough: bool = True) -> BoardView | None:

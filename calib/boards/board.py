@@ -1,4 +1,4 @@
-"""A checkerboard, its view in one image, and the shape of its print.
+"""A checkerboard and a grid of AprilTags, their view in one image, and the shape of its print.
 
 Paper curls, a plate gives way, a printer stretches one side. The drawing's points lie in a plane. A print differs from
 it to second order: out of the plane by a quadratic surface, in the plane by the ratio of its sides. mrcal models the
@@ -9,7 +9,7 @@ diagonal.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,22 +23,8 @@ MIN_SIDE, MAX_SIDE = 3, 60
 MIN_SQUARE_M, MAX_SQUARE_M = 1e-4, 10.0
 # Half side of the window about a checkerboard's corner [squares], less than a half, so that neighbours share no pixel.
 WINDOW = 0.42
-
-
-class CalibrationBoard(Protocol):
-    """A flat board with corners at known points, at which four areas of alternating brightness meet."""
-
-    @property
-    def points(self) -> Array:
-        """Return the corners (N, 3) [m] in the board's frame, z 0."""
-
-    @property
-    def square_m(self) -> float:
-        """Return the unit of length [m] of windows about corners: the side of a square or a tag."""
-
-    @property
-    def window(self) -> float:
-        """Return the half side [squares] of the window about a corner in which grey depends on that corner alone."""
+# Tags as in Kalibr: number of those of the family 36h11, width of the border [bits], bits along a side within it.
+TAGS, TAG_BORDER_BITS, TAG_BITS = 587, 2, 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +60,67 @@ class Board:
 
 
 @dataclass(frozen=True, slots=True)
+class AprilGrid:
+    """A grid of columns x rows AprilTags 36h11 of tag_m, spacing times tag_m apart, as Kalibr prints it.
+
+    The numbers of the tags rise along x, then along y, from 0. Kalibr's frame: x right, y up, origin at the lower left
+    corner of tag 0.
+    """
+
+    columns: int
+    rows: int
+    tag_m: float
+    spacing: float
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.columns * self.rows <= TAGS:
+            raise CalibError(
+                f"board: expected 1 to {TAGS} tags, as the family 36h11 has, found {self.columns}x{self.rows}"
+            )
+        if not MIN_SQUARE_M <= self.tag_m <= MAX_SQUARE_M:
+            raise CalibError(f"board: expected tags of 0.1 mm to 10 m, found {self.tag_m * 1e3:g} mm")
+        if not 0 < self.spacing <= 1:
+            raise CalibError(
+                "board: expected a space between tags of at most a tag's side, like Kalibr's tagSpacing, found "
+                f"{self.spacing:g}"
+            )
+
+    @property
+    def square_m(self) -> float:
+        """Return the side of a tag [m], the unit of the windows about corners."""
+        return self.tag_m
+
+    @property
+    def points(self) -> Array:
+        """Return the corners of all tags (N, 3) [m], row by row upwards, z 0."""
+        x, y = np.meshgrid(self._ends(self.columns), self._ends(self.rows))
+        return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.tag_m)
+
+    @property
+    def window(self) -> float:
+        """Return the half side, in tags, of a window about a tag's corner: its border, the square beside it."""
+        return min(self.spacing, TAG_BORDER_BITS / (TAG_BITS + 2 * TAG_BORDER_BITS))
+
+    @property
+    def tag_corners(self) -> Array:
+        """Return the corners (M, 4, 2) [m] of the tags in the order of cv2.aruco."""
+        y, x = np.divmod(np.arange(self.columns * self.rows), self.columns)
+        # Clockwise from the upper left of the tag in OpenCV's dictionary, which is turned by half a turn as Kalibr
+        # prints it.
+        corner = np.array([[1, 0], [0, 0], [0, 1], [1, 1]])
+        return np.asarray((np.column_stack([x, y])[:, None] * (1 + self.spacing) + corner) * self.tag_m)
+
+    def __str__(self) -> str:
+        return f"AprilTag grid of {self.columns}x{self.rows} tags"
+
+    def _ends(self, tags: int) -> Array:
+        return np.asarray((np.arange(tags)[:, None] * (1 + self.spacing) + [0, 1]).ravel())
+
+
+AnyBoard: TypeAlias = Board | AprilGrid
+
+
+@dataclass(frozen=True, slots=True)
 class BoardView:
     """The corners of a board in one image: pixels (N, 2) in the order of Board.points, NaN for unknown corners.
 
@@ -85,7 +132,7 @@ class BoardView:
     pixels: Array
 
 
-def ambiguous_orders(board: CalibrationBoard) -> list[NDArray[np.intp]]:
+def ambiguous_orders(board: AnyBoard) -> list[NDArray[np.intp]]:
     """Return the orders (N,) of the corners that one image of a board cannot distinguish; the first is the identity.
 
     If one side is odd and one even, the colours determine the order. Otherwise a rotation by 180 degrees is ambiguous,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import WINDOW, CalibrationBoard
+from calib.boards.board import WINDOW, AnyBoard
 from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
@@ -150,7 +150,7 @@ def without_outliers(points: Array, pixels: Array) -> Array:
 
 
 def refine_with_camera(
-    image: NDArray[np.uint8], pixels: Array, board: CalibrationBoard, camera: OcamCamera, T_cam_board: Array
+    image: NDArray[np.uint8], pixels: Array, board: AnyBoard, camera: OcamCamera, T_cam_board: Array
 ) -> Array:
     """Move the pixels (N, 2) of a board's corners onto those of the image, with a camera as the mapping."""
     seen = np.flatnonzero(np.isfinite(pixels[:, 0]))

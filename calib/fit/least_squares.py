@@ -28,6 +28,7 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e8
 # Width of robust functions in standard deviations of a coordinate: of normal errors 86 % of the efficiency of least
 # squares remains with the weights of Geman and McClure 1987, more with those of Huber and Cauchy.
 KERNEL_WIDTH = 2.5
+MAX_STEPS = 60  # of a search, a bound that is never reached by good data
 # Rounds of an estimate whose data or weights depend on its own result.
 ROUNDS = 3
 
@@ -88,25 +89,16 @@ class Problem(Protocol[State]):
         """Return the state after steps (P,) and (K, D); None if there is no such camera."""
 
 
-@dataclass(frozen=True, slots=True)
-class Termination:
-    """Criteria that end a search: a relative gain below `gain` with a damping below `damping`, or `steps` steps.
-
-    A damped step follows the steep directions only: where flat ones count, the last step needs little damping. The
-    number of steps is a bound that is never reached by good data.
-    """
-
-    gain: float
-    damping: float = np.inf
-    steps: int = 60
-
-
-def minimise(problem: Problem[State], state: State, termination: Termination, damping: float = START_DAMPING) -> State:
+def minimise(
+    problem: Problem[State], state: State, gain: float, damping: float = START_DAMPING, last_damping: float = np.inf
+) -> State:
     """Return the state of least cost near the one given (Levenberg and Marquardt).
 
-    damping: of the first step; one next to the minimum needs hardly any.
+    It ends after a step of a relative gain below `gain` with a damping below last_damping: a damped step follows the
+    steep directions only, so that where flat ones count, the last step needs little damping. damping: of the first
+    step; one next to the minimum needs hardly any.
     """
-    for _ in range(termination.steps):
+    for _ in range(MAX_STEPS):
         # 1. Linearise at the state, with the scale of its residuals.
         scale = problem.scale(state)
         cost, system = problem.cost(state, scale), problem.normal_equations(state, scale)
@@ -119,7 +111,7 @@ def minimise(problem: Problem[State], state: State, termination: Termination, da
             trial, trial_cost = _trial(problem, state, system, scale, damping)
         # 3. Take the step. End if it gained little, else lower the damping.
         state = trial
-        if cost - trial_cost < termination.gain * cost and damping < termination.damping:
+        if cost - trial_cost < gain * cost and damping < last_damping:
             return state
         damping = max(MIN_DAMPING, damping / DAMPING_FACTOR)
     return state

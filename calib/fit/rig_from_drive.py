@@ -25,7 +25,6 @@ from calib.fit.least_squares import (
     LOST_PX,
     ROUNDS,
     ArrowSystem,
-    Termination,
     minimise,
     robust_sigma,
 )
@@ -93,7 +92,7 @@ class DriveAdjustment:
     observations: DriveObservations  # those that were used
     covariance: Array  # (P, P) of the steps
     sigma_px: float  # of one coordinate of an observation
-    prior: Array  # (P, P) information of the steps about zero
+    residuals: Array  # (M, 2) measured minus modelled pixels
 
     @property
     def rig(self) -> Rig:
@@ -102,10 +101,8 @@ class DriveAdjustment:
 
     def structure(self, side: int) -> ResidualStructure:
         """Return the systematic part and the noise of the residuals in the lower (0) or in the upper (1) image."""
-        problem = DriveProblem(self.parameters, self.observations, self.prior, np.zeros(1, int))
         seen, mounted = self.observations.camera == side, (self.rig.lower, self.rig.upper)[side]
-        own = problem.residuals(self.state)[seen]
-        return residual_structure(self.observations.pixels[seen], own, mounted.camera.center)
+        return residual_structure(self.observations.pixels[seen], self.residuals[seen], mounted.camera.center)
 
 
 def adjust_drive(
@@ -142,7 +139,7 @@ def adjust_drive(
         problem = replace(problem, observations=observations)
         state, sigma_px = problem.minimised(state, FINE_GAIN if number == ROUNDS - 1 else ROUGH_GAIN)
     covariance = problem.covariance(state, sigma_px, correlated**2 * prior)
-    return DriveAdjustment(parameters, state, observations, covariance, sigma_px, prior)
+    return DriveAdjustment(parameters, state, observations, covariance, sigma_px, problem.residuals(state))
 
 
 def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations) -> Array:
@@ -192,7 +189,7 @@ class DriveProblem:
 
     def minimised(self, state: DriveState, gain: float) -> tuple[DriveState, float]:
         """Return the state of least cost, and the standard deviation [px] of one coordinate there."""
-        found = minimise(self, state, Termination(gain))
+        found = minimise(self, state, gain)
         return found, self.scale(found)
 
     def consistent(self, state: DriveState, sigma_px: float) -> Flags:

@@ -61,18 +61,6 @@ class Mask:
         return np.asarray(inside & (self.image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] > 0))
 
 
-def inscribed_mask(camera: OmniCamera) -> Mask:
-    """Return the largest disc about the camera's axis within its image: the default mask of a mirror camera."""
-    (u, v), (width, height) = camera.center, camera.size
-    return Mask((u, v), 0.0, max(0.0, min(u, v, width - 1 - u, height - 1 - v)))
-
-
-def whole_image(camera: OmniCamera) -> Mask:
-    """Return the smallest disc about the camera's axis that contains its image: the default mask of a lens."""
-    (u, v), (width, height) = camera.center, camera.size
-    return Mask((u, v), 0.0, float(np.hypot(max(u, width - 1 - u), max(v, height - 1 - v))) + 1.0)
-
-
 def inside_image(camera: OmniCamera, pixels: Array) -> NDArray[np.bool_]:
     """True (N,) for pixels (N, 2) on the camera's image; False for NaN."""
     width, height = camera.size

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from calib.errors import CalibError
-from calib.models.camera import Mask, OmniCamera, inscribed_mask, whole_image
+from calib.models.camera import Mask, OmniCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, EquirectangularCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, DISTANCE_M, TANGENTIAL_NAMES, OcamCamera, View
 from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
@@ -124,5 +124,8 @@ def sees_directly(camera: OmniCamera) -> bool:
 
 
 def visible_part(camera: OmniCamera) -> Mask:
-    """Return the mask if none is known: the whole image of a lens, and the largest disc in that of a mirror."""
-    return whole_image(camera) if sees_directly(camera) else inscribed_mask(camera)
+    """Return the mask if none is known: a disc about the whole image of a lens, the largest one in that of a mirror."""
+    (u, v), (width, height) = camera.center, camera.size
+    if sees_directly(camera):
+        return Mask((u, v), 0.0, float(np.hypot(max(u, width - 1 - u), max(v, height - 1 - v))) + 1.0)
+    return Mask((u, v), 0.0, max(0.0, min(u, v, width - 1 - u, height - 1 - v)))

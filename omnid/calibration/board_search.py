@@ -8,15 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from calib.boards.aprilgrid import AprilGrid, find_april_grid
-from calib.boards.board import Board, BoardView
+from calib.boards.aprilgrid import find_april_grid
+from calib.boards.board import AnyBoard, AprilGrid, Board, BoardView
 from calib.boards.checkerboard import find_board
 from calib.models.ocam import View
 from calib.validation import silent
 from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
-AnyBoard = Board | AprilGrid
 Progress = Callable[[str], None]  # receives the lines that a long calibration reports while it runs
 CORNERS_HINT = "count the inner corners, and take images with the whole board in view, sharp and well lit"
 TAGS_HINT = (

@@ -14,12 +14,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards.board import BoardView
+from calib.boards.board import AnyBoard, BoardView
 from calib.models.camera import Array, Mask
 from calib.rim import find_rim
 from drivers.errors import FrameDecodeError
 from drivers.frame import FrameSource, gray
-from omnid.calibration.board_search import AnyBoard, search_board
+from omnid.calibration.board_search import search_board
 from omnid.calibration.images import SIDES, Image, middle_px
 from omnid.errors import OmnidError
 from omnid.transport.codec import DiagnosticStatus

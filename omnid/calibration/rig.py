@@ -11,8 +11,7 @@ import numpy as np
 
 from calib import se3
 from calib.atomic_file import write_file
-from calib.boards.aprilgrid import AprilGrid
-from calib.boards.board import Board, BoardView
+from calib.boards.board import AnyBoard, AprilGrid, Board, BoardView
 from calib.fit.boards.rig_fit import SIDES, PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
@@ -24,7 +23,6 @@ from calib.rim import find_rim
 from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import (
-    AnyBoard,
     Progress,
     find_boards,
     view_of_tags,

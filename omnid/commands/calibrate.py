@@ -14,15 +14,13 @@ import numpy as np
 
 from calib import se3
 from calib.atomic_file import write_file
-from calib.boards.aprilgrid import AprilGrid
-from calib.boards.board import Board
-from calib.importers import import_chain, import_pair, read_transform, stacked_rig, straight_up
+from calib.boards.board import AnyBoard, AprilGrid, Board
+from calib.importers import import_pair, parse_chain, read_transform, stacked_rig, straight_up
 from calib.models.names import model_in_words
 from calib.rig import Rig
 from calib.rig_file import png, read_rig, write_rig
-from calib.validation import silent
+from calib.validation import read_text, silent
 from drivers.logs.log_reader import LogCameras, LogReader
-from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
 from omnid.calibration.images import SIDES, read_pairs
@@ -292,7 +290,8 @@ def _imported(args: argparse.Namespace) -> Rig:
     if given == {"equirectangular", "baseline"}:
         return stacked_rig(args.equirectangular, args.baseline)
     if "camchain" in given <= {"camchain", "lower", "upper"}:
-        return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, options.warn)
+        text, path = read_text(args.camchain), str(args.camchain)
+        return parse_chain(text, path, args.lower or "", args.upper or "", args.frame, options.warn)
     if given - {"view"} in ({"lower", "upper", "transform"}, {"lower", "upper", "baseline"}):
         T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
         return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", options.warn)

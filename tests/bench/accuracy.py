@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import omnid
 from calib import se3
-from calib.importers import import_chain
+from calib.importers import parse_chain
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.run_summary import summary_entries
@@ -102,7 +102,7 @@ def rig_of(folder: Path) -> Rig:
         return read_rig(folder / "rig.toml")
     with TemporaryDirectory() as work:
         path = Path(work) / "rig.toml"
-        write_rig(path, import_chain(camchain))
+        write_rig(path, parse_chain(Path(camchain).read_text()))
         return read_rig(path)
 
 

@@ -30,8 +30,7 @@ import numpy as np
 
 import omnid
 from calib import se3
-from calib.boards.aprilgrid import AprilGrid
-from calib.boards.board import AS_DRAWN, Board, PrintShape
+from calib.boards.board import AS_DRAWN, AprilGrid, Board, PrintShape
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.rig import Rig
 from calib.rig_file import read_rig

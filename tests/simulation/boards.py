@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.aprilgrid import AprilGrid
-from calib.boards.board import AS_DRAWN, Board, PrintShape
+from calib.boards.board import AS_DRAWN, AprilGrid, Board, PrintShape
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
 from omnid.simulation.rendering.ray_caster import render_grey

@@ -20,7 +20,7 @@ uncertainty of lengths. The radius h of the horizon on the mirror [m] is unknown
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -28,10 +28,8 @@ import numpy as np
 import scipy
 
 from calib import se3
-from calib.boards.board import MODE_NAMES, MODE_SIGMAS, CalibrationBoard, PrintShape, all_modes
+from calib.boards.board import MODE_NAMES, MODE_SIGMAS, AnyBoard, PrintShape, all_modes
 from calib.errors import CalibError
-from calib.fit.boards.derivatives import pixel_derivatives
-from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.fit.least_squares import (
     BEST_STEP,
     DAMPING_FACTOR,
@@ -40,7 +38,6 @@ from calib.fit.least_squares import (
     ROUNDS,
     START_DAMPING,
     ArrowSystem,
-    Termination,
     central_differences,
     minimise,
     robust_sigma,
@@ -49,7 +46,7 @@ from calib.fit.parameters import WAVEFRONT_UNIT_M, stepped, units_of
 from calib.models.camera import Array
 from calib.models.names import values_of
 from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
-from calib.models.wavefront import WAVEFRONT_NAMES
+from calib.models.wavefront import WAVEFRONT_NAMES, directions_to
 
 # Prior of h: two of three mirrors are between 14 and 46 mm, because mirrors are 5 to 20 cm wide. With 15 or 50 mm as
 # its median the lengths of ten rigs change by less than 0.01 %.
@@ -94,7 +91,7 @@ SHRUNK_SIGMAS: Final = np.array([0.1, 0.1, 1.0, 1.0])
 TWIST_NAMES: Final = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
 # A damped step hardly moves along a flat direction: so the search ends only with a nearly undamped step that lowers the
 # cost in its ninth digit.
-TERMINATION: Final = Termination(gain=1e-9, damping=1e-7)
+GAIN, LAST_DAMPING = 1e-9, 1e-7
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +153,7 @@ class BoardFit:
         return float(np.nanmean(self.errors_px))
 
 
-def fit_boards(start: BoardRig, pixels: Array, board: CalibrationBoard, *, telecentric: bool = False) -> BoardFit:
+def fit_boards(start: BoardRig, pixels: Array, board: AnyBoard, *, telecentric: bool = False) -> BoardFit:
     """Return the most likely cameras and boards near a start, by corners (K, C, N, 2) [px], NaN for unknown ones.
 
     telecentric: the cameras look at mirrors by parallel rays, see mirror_residuals. CalibError where no camera fits.
@@ -168,8 +165,8 @@ def fit_boards(start: BoardRig, pixels: Array, board: CalibrationBoard, *, telec
     for _ in range(ROUNDS):
         sigma = min(sigma, robust_sigma(state.residuals))
         problem = replace(problem, kernel_px=KERNEL_WIDTH * sigma)
-        state = minimise(problem, state, TERMINATION, damping)
-        damping = min(START_DAMPING, TERMINATION.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
+        state = minimise(problem, state, GAIN, damping, LAST_DAMPING)
+        damping = min(START_DAMPING, LAST_DAMPING / DAMPING_FACTOR)  # the next one begins next to its minimum
     return problem.result(state)
 
 
@@ -303,7 +300,7 @@ class _BoardProblem:
         J_common, J_pose = np.zeros((K, C, N, 2, len(units))), np.zeros((K, C, N, 2, 6))
         for side, (camera, T) in enumerate(zip(rig.cameras, rig.transforms(), strict=True)):
             points = se3.apply(T, drawn).reshape(-1, 3)
-            by_point, by_own = map(_finite, pixel_derivatives(camera, points, rig.names))
+            by_point, by_own = pixel_derivatives(camera, points, rig.names)
             own = slice(side * n, side * n + n - 1)
             J_common[:, side, ..., own] = by_own.reshape(K, N, 2, -1) * units[own]
             by_mode = np.einsum("kij,njs->knis", se3.R_of(T), self.modes)
@@ -346,6 +343,139 @@ def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:
     return np.nan_to_num(residual), weight
 
 
-def _finite(values: Array) -> Array:
-    """Return values with 0 for those that are not finite: a point without an image has no derivative."""
-    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+@np.errstate(all="ignore")
+def pixel_derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the derivatives (N, 2, 3) by points (N, 3) [m], near ones as they are, and (N, 2, P) by the parameters.
+
+    They are 0 where the camera does not see a point. Scaramuzza et al. 2006, with the implicit function f(rho) r - z
+    rho = 0 for the radius; by differences for wavefronts. d moves e along, as in models/names.py.
+    """
+    waves = [name for name in names if name in WAVEFRONT_NAMES]
+    # 1. The direction of the ray through the point, of a mirror whose rays do not meet in one point.
+    ray_by_point, rays = None, points
+    ray_by_wave = dict[str, Array]()
+    if waves or any(camera.wavefront):
+        axis, wavefront = -camera.sign, np.array(camera.wavefront)
+        rays = directions_to(points, camera.wavefront, axis)
+        step = BEST_STEP * np.ones(len(wavefront))
+        ray_by_point = central_differences(lambda by: directions_to(points + by, camera.wavefront, axis), step[:3])
+        by_term = central_differences(lambda by: directions_to(points, tuple((wavefront + by).tolist()), axis), step)
+        ray_by_wave = {name: by_term[..., WAVEFRONT_NAMES.index(name)] for name in waves}
+    # 2. The radius of that direction.
+    X, Y, z = rays[:, 0], rays[:, 1], camera.sign * rays[:, 2]
+    r = np.hypot(X, Y)
+    rho = camera.radius(r, z)
+    f, slope = camera.height_and_slope(rho)
+    by_rho = slope * r - z
+    is_off_axis = r > 1e-12 * np.abs(z)
+    safe = np.where(is_off_axis, r, 1.0)
+    ux, uy = np.where(is_off_axis, X / safe, 0.0), np.where(is_off_axis, Y / safe, 0.0)
+    ratio = np.where(is_off_axis, rho / safe, f / z)
+    rho_by_r, rho_by_z = -f / by_rho, rho / by_rho
+    # 3. The ideal point rho (X, Y) / r.
+    x, y = X * ratio, Y * ratio
+    cross = (rho_by_r - ratio) * ux * uy
+    ideal_by_ray = np.stack(
+        [
+            _pairs(ratio + (rho_by_r - ratio) * ux * ux, cross),
+            _pairs(cross, ratio + (rho_by_r - ratio) * uy * uy),
+            _pairs(ux, uy) * (camera.sign * rho_by_z)[:, None],
+        ],
+        axis=2,
+    )
+    # 4. Tangential and astigmatic terms, and the affine.
+    bent_x, bent_y = camera.distort(x, y)
+    xx, xy, yy = camera.distortion_jacobian(x, y)
+    c, d, e = camera.affine
+    affine = np.array([[e, 1.0], [c, d]])
+    A = affine @ np.stack([_pairs(xx, xy), _pairs(xy, yy)], axis=1)
+    by_ray = A @ ideal_by_ray
+    x2, y2, rho2, zero, one = x * x, y * y, x * x + y * y, np.zeros(len(x)), np.ones(len(x))
+    columns = {
+        "center_row": _pairs(zero, one),
+        "center_column": _pairs(one, zero),
+        "c": _pairs(zero, bent_x),
+        "d": _pairs(bent_x, bent_y),
+        TANGENTIAL_NAMES[0]: _pairs(2 * x * y, rho2 + 2 * y2) @ affine.T,
+        TANGENTIAL_NAMES[1]: _pairs(rho2 + 2 * x2, 2 * x * y) @ affine.T,
+        ASTIGMATISM_NAMES[0]: _pairs(4 * x2 * x, -4 * y2 * y) @ affine.T,
+        ASTIGMATISM_NAMES[1]: _pairs(6 * x2 * y + 2 * y2 * y, 2 * x2 * x + 6 * x * y2) @ affine.T,
+    }
+    for name in names:
+        if name[0] == "a":
+            columns[name] = np.einsum("nij,nj->ni", A, _pairs(ux, uy) * (-r * rho ** int(name[1:]) / by_rho)[:, None])
+    columns |= {name: np.einsum("nij,nj->ni", by_ray, change) for name, change in ray_by_wave.items()}
+    by_point = by_ray if ray_by_point is None else by_ray @ ray_by_point
+    by_name = np.stack([columns[name] for name in names], axis=2)
+    return np.nan_to_num(by_point, posinf=0.0, neginf=0.0), np.nan_to_num(by_name, posinf=0.0, neginf=0.0)
+
+
+def _pairs(u: Array, v: Array) -> Array:
+    return np.stack([u, v], axis=1)
+
+
+# The error of a camera model is a smooth function of the image position, the same in all views. Most of it is absorbed
+# by the parameters, which it shifts; what remains correlates the residuals, and this correlation shows its size. So
+# residuals have the covariance sigma^2 I + tau^2 F F^T, where the columns of F are smooth fields: gradients of
+# Gaussian functions on a grid. A mirror or lens whose surface is not the model's deflects rays by the gradient of the
+# difference of the surfaces, so such fields have no swirl: they move elevations, and hardly turn a camera about its
+# axis.
+#
+# tau^2 is the mean of its posterior distribution by the restricted likelihood (Patterson and Thompson 1971) with a
+# flat prior of tau / sigma (Gelman 2006): the most likely value of few data is often 0.
+#
+# Nodes of the fields along the diameter of the seen part of an image: five follow three waves over the azimuth and a
+# turning point over the radius. Each field is as wide as the distance of two nodes.
+NODES = 5
+# Values of tau / sigma over which the posterior is summed: steps of 4 % are fine enough for any ratio.
+RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])
+# Smaller eigenvalues of what the fields explain beyond the parameters, as a fraction of the largest, are rounding.
+MIN_EIGENVALUE_RATIO = 1e-3
+
+
+def smooth_fields(pixels: Array, cameras: int) -> Array:
+    """Return the fields (K, N, 2, F) at pixels (K, N, 2), of which equal parts belong to each camera.
+
+    Rows of unknown pixels (NaN) are 0. The sum of all fields has about unit size.
+    """
+    K, N, _ = pixels.shape
+    own, width = [], 2 / (NODES - 1)
+    for part in np.split(pixels, cameras, axis=1):
+        known = part[np.isfinite(part).all(axis=2)]
+        center = known.mean(axis=0)
+        radius = float(np.linalg.norm(known - center, axis=1).max())
+        line = np.linspace(-1, 1, NODES)
+        nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+        away = ((part[:, :, None] - center) / radius - nodes) / width
+        gaussian = np.exp(-0.5 * (away**2).sum(axis=3, keepdims=True))
+        own.append(np.nan_to_num(-away * gaussian).swapaxes(2, 3))
+    counts = [each.shape[3] for each in own]
+    fields = np.zeros((K, N, 2, sum(counts)))
+    first, size = 0, N // cameras
+    for camera, values in enumerate(own):
+        fields[:, camera * size : (camera + 1) * size, :, first : first + counts[camera]] = values
+        first += counts[camera]
+    return fields
+
+
+def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, variance: float) -> Array:
+    """Return the covariance (P, P) of the parameters.
+
+    normal (P + F, P + F), gradient (P + F,): of the weighted residuals by parameters and fields, poses eliminated, at
+    the fit's minimum; variance: sigma^2 of a coordinate [px^2].
+    """
+    P = parameters
+    inverse = np.linalg.pinv(normal[:P, :P], rcond=1e-14, hermitian=True)
+    # What the fields explain beyond the parameters: y ~ N(0, sigma^2 d + tau^2 d^2) along each eigenvector.
+    by_field = normal[P:, :P] @ inverse
+    unexplained = normal[P:, P:] - by_field @ normal[:P, P:]
+    d, axes = np.linalg.eigh((unexplained + unexplained.T) / 2)
+    known = d > MIN_EIGENVALUE_RATIO * max(float(d[-1]), 1.0)
+    d, y = d[known], (axes.T @ (gradient[P:] - by_field @ gradient[:P]))[known]
+    # The posterior mean of (tau / sigma)^2.
+    spread = variance * (d + RATIOS[:, None] ** 2 * d**2)
+    cost = (np.log(spread) + y**2 / spread).sum(axis=1)
+    weight = np.exp(-0.5 * (cost - cost.min())) * np.gradient(RATIOS)
+    ratio2 = float(weight @ RATIOS**2 / weight.sum()) if len(d) else 0.0
+    # The fit does not know the fields: each shifts the parameters by its row of by_field, which has the prior tau.
+    return np.asarray(variance * (inverse + ratio2 * by_field.T @ by_field))

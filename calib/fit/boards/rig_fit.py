@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import AS_DRAWN, BoardView, CalibrationBoard, PrintShape
+from calib.boards.board import AS_DRAWN, AnyBoard, BoardView, PrintShape
 from calib.boards.local_mapping import refine_with_camera
 from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
@@ -58,7 +58,7 @@ class RigCalibration:
     """A calibrated camera, or a pair of them, and the views that it was fitted to."""
 
     fit: BoardFit
-    board: CalibrationBoard
+    board: AnyBoard
     views: tuple[PairView, ...]  # K
     rejected: tuple[RejectedView, ...] = ()
     telecentric: bool = False  # True if the cameras were fitted as mirrors below telecentric lenses
@@ -113,7 +113,7 @@ class RigCalibration:
 
 def calibrate_boards(
     views: Sequence[PairView],
-    board: CalibrationBoard,
+    board: AnyBoard,
     sizes: Sequence[tuple[int, int]],
     view: View = "mirror",
     images: Sequence[Images] = (),
@@ -178,7 +178,7 @@ def refined_views(found: RigCalibration, images: Sequence[Images]) -> list[PairV
 
 
 def consistent_views(
-    views: Sequence[PairView], board: CalibrationBoard, size: tuple[int, int], view: View
+    views: Sequence[PairView], board: AnyBoard, size: tuple[int, int], view: View
 ) -> tuple[list[PairView], list[RejectedView], LinearCamera]:
     """Reject views of one camera with large errors in the linear solution, the worst first; it affects the others."""
     _require(len(views), "views of the board")
@@ -215,7 +215,7 @@ def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
     return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.fit.covariance[:count, :count] @ J.T)
 
 
-def _fit_pair(views: Sequence[PairView], board: CalibrationBoard, alone: Sequence[RigCalibration]) -> RigCalibration:
+def _fit_pair(views: Sequence[PairView], board: AnyBoard, alone: Sequence[RigCalibration]) -> RigCalibration:
     """Fit two cameras and the transform between them."""
     _require(_pairs(views), "instants at which both cameras saw the board")
     cameras = (alone[0].cameras[0], alone[1].cameras[0])
@@ -242,7 +242,7 @@ def _fit_pair(views: Sequence[PairView], board: CalibrationBoard, alone: Sequenc
     return replace(found, rejected=(*rejected, *found.rejected))
 
 
-def _without_outliers(start: BoardRig, views: Sequence[PairView], board: CalibrationBoard) -> RigCalibration:
+def _without_outliers(start: BoardRig, views: Sequence[PairView], board: AnyBoard) -> RigCalibration:
     """Fit cameras to views; as long as views fit much worse than the others, leave out these, a third at most."""
     good, rejected = list(views), list[RejectedView]()
     while True:
@@ -261,7 +261,7 @@ def _without_outliers(start: BoardRig, views: Sequence[PairView], board: Calibra
         start = replace(fit.rig, T_lower_board=fit.rig.T_lower_board[~bad])
 
 
-def _pixels(views: Sequence[PairView], board: CalibrationBoard) -> Array:
+def _pixels(views: Sequence[PairView], board: AnyBoard) -> Array:
     """Return the corners (K, C, N, 2) of views, NaN for those that a camera does not see."""
     none = np.full((len(board.points), 2), np.nan)
     return np.array([[none if seen is None else seen.pixels for seen in view.seen] for view in views])

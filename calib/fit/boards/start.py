@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import CalibrationBoard, ambiguous_orders
+from calib.boards.board import AnyBoard, ambiguous_orders
 from calib.errors import CalibError
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
@@ -147,7 +147,7 @@ class RelativePoseInitialisation:
 
 
 def initialise_relative_pose(
-    lower: Mapping[int, Array], upper: Mapping[int, Array], board: CalibrationBoard
+    lower: Mapping[int, Array], upper: Mapping[int, Array], board: AnyBoard
 ) -> RelativePoseInitialisation:
     """Find the transform with the most consistent pairs, by the board's poses (4, 4) in front of each camera, by view.
 

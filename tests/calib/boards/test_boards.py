@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.boards.aprilgrid import AprilGrid, find_april_grid
-from calib.boards.board import Board
+from calib.boards.aprilgrid import find_april_grid
+from calib.boards.board import AprilGrid, Board
 from calib.boards.checkerboard import find_board
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.boards.aprilgrid import AprilGrid, find_april_grid
-from calib.boards.board import Board, BoardView
+from calib.boards.aprilgrid import find_april_grid
+from calib.boards.board import AprilGrid, Board, BoardView
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards
 from calib.fit.parameters import LINE_TIME, UPPER_DELAY, RigParameters
 from calib.fit.residual_structure import ResidualStructure
