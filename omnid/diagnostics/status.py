@@ -191,14 +191,13 @@ def rig_stats(health: RigHealth) -> Stats:
 
 
 def image_stats(newest: OdometryUpdate | None) -> Stats:
-    """Return which cameras show parts that are frozen or blind in the newest pair, and how long."""
+    """Return which cameras show parts that are frozen or blind in the newest pair."""
     if newest is None:
         return {"_stale": "no pose yet"}
-    tiles, since_s, words = newest.depth.panoramas.tiles, {}, []
+    tiles, words = newest.depth.panoramas.tiles, []
     for side in SIDES:
         columns = tiles.columns.get(side, np.zeros(0, bool))
         if columns.any():
-            since_s[f"{side}_since_s"] = round((newest.stamp_ns - tiles.since_ns[side]) * S_PER_NS)
             where = "all around" if columns.all() else "in a part of its view"
             words.append(f"the {side} camera is {'frozen' if tiles.dead[side].any() else 'blind'} {where}")
-    return {**since_s, "_error": "; ".join(words), "_words": status_names.LIVE}
+    return {"_error": "; ".join(words), "_words": status_names.LIVE}

@@ -90,7 +90,7 @@ class Dewarp:
         )
         # 4. Times of exposure of the pixels, and parts of the images that are dead or blind.
         times = PixelTimes(pair.skew_s + self._upper_delay_s, *self._rows_s)
-        tiles = self._tiles.update(pair.stamp_ns, grey, sums, self._noise_grey)
+        tiles = self._tiles.update(grey, sums, self._noise_grey)
         return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
 
 

@@ -14,8 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.stereo.anchors import AnchorPropagation, Candidates
-from omnid.core.stereo.sad import NO_MATCH, Costs, Flags, Floats, Image, Indices, SadVolume, local_minima, subpixel
-from omnid.core.stereo.semiglobal import ColumnShift, SemiGlobalSearch
+from omnid.core.stereo.semiglobal import (
+    NO_MATCH,
+    ColumnShift,
+    Costs,
+    Flags,
+    Floats,
+    Image,
+    Indices,
+    SemiGlobalSearch,
+    local_minima,
+    sad,
+    subpixel,
+)
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
@@ -96,6 +107,42 @@ class Matcher:
         least = max(m.edge_threshold, round(EDGE_NOISE * noise_grey))
         pixels = edge_pixels(lower, valid, least, m.max_points)
         return self._search.search(lower, upper, pixels, column_shift)
+
+
+class SadVolume:
+    """SAD of every pixel of the lower panorama and the pixel d rows below it in the upper one, d = 0 .. D-1.
+
+    The planes (D, H, W) uint16 are allocated once.
+    """
+
+    def __init__(self, shape: tuple[int, int], disparities: int, window_px: int) -> None:
+        self._window_px = window_px
+        self._planes = np.full((min(disparities, shape[0]), *shape), NO_MATCH, np.uint16)
+
+    def fill(self, lower: Image, upper: Image) -> None:
+        """Compute the planes for a pair of panoramas (H, W)."""
+        for d, plane in enumerate(self._planes):
+            rows = len(lower) - d
+            plane[:rows] = sad(lower[:rows], upper[d:], self._window_px)
+
+    def at(self, pixels: Indices) -> Costs:
+        """Return the costs (D, N) of pixels of the lower panorama (flat indices)."""
+        return np.array([np.take(plane.reshape(-1), pixels, mode="clip") for plane in self._planes])
+
+    def best_from_upper(self, pixels: Indices, disparity: Indices) -> tuple[Indices, Costs]:
+        """Return the best disparities (N,) of the upper panorama's pixels, and their costs (N,): the left-right check.
+
+        The upper pixels are given by pixels (N,) of the lower panorama and their disparities (N,).
+        """
+        width = self._planes.shape[2]
+        upper = pixels + disparity * width
+        best = np.full(len(pixels), NO_MATCH, np.uint16)
+        choice = np.zeros(len(pixels), np.intp)
+        for d, plane in enumerate(self._planes):
+            cost = np.take(plane.reshape(-1), np.maximum(upper - d * width, 0), mode="clip")
+            better = (cost < best) & (upper >= d * width)
+            best[better], choice[better] = cost[better], d
+        return choice, best
 
 
 class ColumnSearch:

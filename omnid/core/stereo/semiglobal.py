@@ -1,5 +1,7 @@
 """Semi-global matching at half the resolution, refined at full resolution by the SAD near it.
 
+SAD: sums of absolute differences along the columns of two panoramas, Dang et al. 2012, eq. (1).
+
 Where a texture repeats, the window of a pixel cannot distinguish its candidates. The path costs of Hirschmueller 2008
 carry the answer from where it is unambiguous. OpenCV's StereoSGBM (5 paths) computes them on transposed panoramas; the
 SAD at full resolution then searches near this prior only.
@@ -11,9 +13,16 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from omnid.core.stereo.sad import NO_MATCH, Flags, Floats, Image, Indices, local_minima, sad, subpixel
+Image = NDArray[np.uint8]
+Costs = NDArray[np.uint16]
+Floats = NDArray[np.float32]
+Indices = NDArray[np.intp]
+Flags = NDArray[np.bool_]
 
+NO_MATCH: Final = np.uint16(65535)  # cost of a match outside the image; the largest of uint16, so that none chooses it
+MIN_SLOPE: Final = 1.0  # grey levels per pixel of the sum, so that a flat minimum divides by no zero
 BLOCK_PX: Final = 3  # side of StereoSGBM's matching window at the prior's resolution; the least of its range of 3 to 11
 SMALL_STEP_PENALTY: Final = 100  # Penalty of a change of disparity by one, because walls are smooth.
 LARGE_STEP_PENALTY: Final = 3200  # Penalty of a larger change, because depth edges are rare.
@@ -104,3 +113,30 @@ class SemiGlobalSearch:
         """
         small = cv2.resize(panorama, None, fx=1 / SCALE, fy=1 / SCALE, interpolation=cv2.INTER_AREA)
         return np.ascontiguousarray(cv2.copyMakeBorder(small, 0, self._searched, 0, 0, cv2.BORDER_REPLICATE).T[:, ::-1])
+
+
+def sad(lower: Image, upper: Image, window_px: int) -> Costs:
+    """Return the SAD (H, W) of windows about the same pixels of two images; a window of up to 15 px fits 16 bits."""
+    window, border = (window_px, window_px), cv2.BORDER_REPLICATE
+    found = cv2.boxFilter(cv2.absdiff(lower, upper), cv2.CV_16U, window, normalize=False, borderType=border)
+    return np.asarray(found, np.uint16)
+
+
+def local_minima(costs: Costs, limit: Costs | int) -> Flags:
+    """Return flags (D, N) of the costs that are minima along D and not above a limit; the ends of D are no minima."""
+    minima = np.zeros(costs.shape, bool)
+    before, at, after = costs[:-2], costs[1:-1], costs[2:]
+    minima[1:-1] = (at < before) & (at <= after) & (at <= limit) & (after < NO_MATCH)
+    return minima
+
+
+def subpixel(costs: Costs, disparity: Indices) -> Floats:
+    """Return disparities (N,) refined to where two lines of equal slope through the minimum's sides meet.
+
+    A sum of absolute differences is V-shaped about its minimum, so lines fit it better than a parabola.
+    """
+    each = np.arange(costs.shape[1])
+    middle = np.clip(disparity, 1, len(costs) - 2)
+    before, at, after = (costs[middle + k, each].astype(np.float32) for k in (-1, 0, 1))
+    steeper = np.maximum(np.maximum(before, after) - at, MIN_SLOPE)
+    return np.asarray(middle + np.clip((before - after) / (2 * steeper), -0.5, 0.5), np.float32)

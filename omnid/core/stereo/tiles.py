@@ -55,39 +55,6 @@ class TileSums:
     is_first: bool
 
 
-class TileSampler:
-    """Sums of the panoramas (H, W) of one camera."""
-
-    def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
-        """visible (H, W): pixels that show the world; columns of tiles in W."""
-        tile_pixels = visible.size / (TILE_ROWS * columns)
-        self._spacing_px = SPACING_PX if tile_pixels >= LEAST_SAMPLES * SPACING_PX**2 else 1
-        self._mask = self._sampled(np.where(visible, np.uint8(255), np.uint8(0)))
-        self._rows, self._columns = borders(self._mask.shape[0], TILE_ROWS), borders(self._mask.shape[1], columns)
-        self._before: Image | None = None
-        self.pixels = self._sums(np.asarray(self._mask & 1, np.uint8))
-        # Tiles that show less of the world are not judged.
-        self.judged = self.pixels >= MOST * np.diff(self._rows)[:, None] * np.diff(self._columns)
-
-    def add(self, panorama: Image) -> TileSums:
-        """Return the sums of the next panorama (H, W)."""
-        sample = np.asarray(cv2.bitwise_and(self._sampled(panorama), self._mask), np.uint8)
-        before, self._before = self._before, sample
-        saturated = np.asarray(cv2.threshold(sample, SATURATED_GREY - 1, 1, cv2.THRESH_BINARY)[1], np.uint8)
-        change = np.asarray(cv2.absdiff(sample, sample if before is None else before), np.uint8)
-        grey, square = self._sums(sample), self._sums(sample, cv2.REDUCE_SUM2)
-        return TileSums(self.pixels, grey, square, self._sums(saturated), self._sums(change), before is None)
-
-    def _sampled(self, image: Image) -> Image:
-        return np.ascontiguousarray(image[:: self._spacing_px, :: self._spacing_px])
-
-    def _sums(self, image: Image, operation: int = cv2.REDUCE_SUM) -> Numbers:
-        """Return the sums (TILE_ROWS, C) of an image over each tile, or those of its squares."""
-        bands = [image[low:high] for low, high in pairwise(self._rows)]
-        by_column = np.array([cv2.reduce(band, 0, operation, dtype=cv2.CV_64F)[0] for band in bands])
-        return np.add.reduceat(by_column, self._columns[:-1], axis=1).astype(np.int32)
-
-
 def borders(pixels: int, tiles: int) -> NDArray[np.int32]:
     """Return the first pixel of each tile along a side, and the end (tiles + 1,)."""
     return np.rint(np.arange(tiles + 1) * pixels / tiles).astype(np.int32)
@@ -126,7 +93,6 @@ class TileStates:
     dead: dict[Side, Flags] = field(default_factory=dict)  # (TILE_ROWS, C), C the panorama's columns of tiles
     blind: dict[Side, Flags] = field(default_factory=dict)  # the same
     columns: dict[Side, Flags] = field(default_factory=dict)  # (C,) in which it shows nothing to rely on
-    since_ns: dict[Side, int] = field(default_factory=dict)  # first pair of those in a row with such columns
 
     @property
     def unknown(self) -> Flags:
@@ -159,28 +125,45 @@ class TileMonitor:
 
     def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
         """visible (H, W): pixels that show the world; columns of tiles in W."""
-        self._columns = columns
-        self._samplers = {side: TileSampler(visible, columns) for side in SIDES}
-        sampler = self._samplers["lower"]
-        self._counts = np.maximum(sampler.pixels, 1)
-        self._judged = sampler.judged
-        # Pixels at half resolution, all of which show the world, and so do their neighbours.
+        # 1. The sums of each tile; those that show less of the world are not judged.
+        self._spacing_px = SPACING_PX if visible.size >= LEAST_SAMPLES * SPACING_PX**2 * TILE_ROWS * columns else 1
+        self._mask = self._sampled(np.where(visible, np.uint8(255), np.uint8(0)))
+        self._rows, self._columns = borders(self._mask.shape[0], TILE_ROWS), borders(self._mask.shape[1], columns)
+        self._before: dict[Side, Image] = {}
+        self._pixels = self._tile_sums(np.asarray(self._mask & 1, np.uint8))
+        self._judged = self._pixels >= MOST * np.diff(self._rows)[:, None] * np.diff(self._columns)
+        self._counts = np.maximum(self._pixels, 1)
+        # 2. Pixels at half resolution, all of which show the world, and so do their neighbours.
         height, width = visible.shape[0] // 2, visible.shape[1] // 2
         shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))[: 2 * height, : 2 * width]
         half = shown.reshape(height, 2, width, 2).min(axis=(1, 3))
         self._half_mask, self._half_columns = 255 * half, borders(width, columns)[:-1]
         self._half_counts = np.maximum(np.add.reduceat(half.sum(axis=0, dtype=np.int64), self._half_columns), 1)
-        self._since_ns = dict.fromkeys(SIDES, 0)
         self._lively = {side: np.zeros(self._judged.shape) for side in SIDES}  # share of pairs that changed
         self._still = {side: np.zeros(self._judged.shape, np.intp) for side in SIDES}  # pairs in a row without change
         self._faint = {side: np.zeros(columns, np.intp) for side in SIDES}  # pairs in a row with little energy
 
     def sums(self, side: Side, panorama: Image) -> TileSums:
         """Return the sums of a camera's next panorama (H, W) as the camera gave it."""
-        return self._samplers[side].add(panorama)
+        sample = np.asarray(cv2.bitwise_and(self._sampled(panorama), self._mask), np.uint8)
+        before, self._before[side] = self._before.get(side), sample
+        saturated = np.asarray(cv2.threshold(sample, SATURATED_GREY - 1, 1, cv2.THRESH_BINARY)[1], np.uint8)
+        change = np.asarray(cv2.absdiff(sample, sample if before is None else before), np.uint8)
+        grey, square = self._tile_sums(sample), self._tile_sums(sample, cv2.REDUCE_SUM2)
+        of_both = self._tile_sums(saturated), self._tile_sums(change)
+        return TileSums(self._pixels, grey, square, *of_both, is_first=before is None)
+
+    def _sampled(self, image: Image) -> Image:
+        return np.ascontiguousarray(image[:: self._spacing_px, :: self._spacing_px])
+
+    def _tile_sums(self, image: Image, operation: int = cv2.REDUCE_SUM) -> Numbers:
+        """Return the sums (TILE_ROWS, C) of an image over each tile, or those of its squares."""
+        bands = [image[low:high] for low, high in pairwise(self._rows)]
+        by_column = np.array([cv2.reduce(band, 0, operation, dtype=cv2.CV_64F)[0] for band in bands])
+        return np.add.reduceat(by_column, self._columns[:-1], axis=1).astype(np.int32)
 
     def update(
-        self, stamp_ns: int, images: dict[Side, Image], sums: dict[Side, TileSums], noise_grey: dict[Side, float]
+        self, images: dict[Side, Image], sums: dict[Side, TileSums], noise_grey: dict[Side, float]
     ) -> TileStates:
         """Return the states for panoramas (H, W) as the cameras gave them, with their sums and their noise."""
         # 1. What each camera shows by itself.
@@ -200,11 +183,9 @@ class TileMonitor:
         # 3. Directions.
         counts = np.maximum(self._judged.sum(axis=0), 1)
         columns = {side: dead[side].any(axis=0) | (blind[side].sum(axis=0) > MOST * counts) for side in SIDES}
-        for side in SIDES:
-            self._since_ns[side] = (self._since_ns[side] or stamp_ns) if columns[side].any() else 0
         if not any(states[side].any() for states in (dead, blind) for side in SIDES):
             return ALL_LIVE
-        return TileStates(dead, blind, columns, dict(self._since_ns))
+        return TileStates(dead, blind, columns)
 
     def _dead(
         self, side: Side, change: Array, contrast: Array, blind: Flags, noise_grey: float, *, is_first: bool
@@ -245,20 +226,16 @@ class TileMonitor:
         """Return the columns (C,) in which a camera shows far less than the other one does."""
         textured = other > LEAST_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
         ratio = energy / np.maximum(other, 1e-6)
-        is_faint = np.zeros(self._columns, bool)
+        is_faint = np.zeros(len(energy), bool)
         # With texture in less than a quarter of a turn, a single poster would decide what is usual.
         if textured.sum() >= TILE_COLUMNS // 4:
             is_faint = textured & (ratio < BLURRED_SHARE * float(np.median(ratio[textured])))
         if not is_faint.any():
-            self._faint[side] = np.zeros(self._columns, np.intp)
+            self._faint[side][:] = 0
             return is_faint
-        # Runs of such columns, and those next to them, which dirt covers in part. The ends of a sector are no
-        # neighbours.
-        is_sector = self._columns < TILE_COLUMNS
-        is_faint = np.pad(is_faint, BLURRED_COLUMNS + 1) if is_sector else is_faint
+        # Runs of such columns, and those next to them, which dirt covers in part.
         is_wide = np.logical_and.reduce([np.roll(is_faint, -shift) for shift in range(BLURRED_COLUMNS)])
         is_faint = np.logical_or.reduce([np.roll(is_wide, shift) for shift in range(-1, BLURRED_COLUMNS + 1)])
-        is_faint = is_faint[BLURRED_COLUMNS + 1 : -BLURRED_COLUMNS - 1] if is_sector else is_faint
         self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)
         return np.asarray(self._faint[side] >= IN_A_ROW)
 

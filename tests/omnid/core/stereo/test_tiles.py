@@ -18,7 +18,6 @@ from omnid.core.stereo.tiles import (
     SIDES,
     Side,
     TileMonitor,
-    TileSampler,
     TileStates,
     TileSums,
 )
@@ -31,12 +30,10 @@ PART = slice(300, 600)  # columns: a third
 INSIDE, OUTSIDE = slice(21, 39), [*range(19), *range(41, 60)]  # tiles of it, and those that it does not touch
 
 
-def states_after(
-    monitor: TileMonitor, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]
-) -> TileStates:
+def states_after(monitor: TileMonitor, images: dict[Side, Image], noise_grey: dict[Side, float]) -> TileStates:
     """Return the states after a pair."""
     sums = {side: monitor.sums(side, images[side]) for side in SIDES}
-    return monitor.update(stamp_ns, images, sums, noise_grey)
+    return monitor.update(images, sums, noise_grey)
 
 
 class Cameras:
@@ -47,7 +44,6 @@ class Cameras:
         coarse = self._rng.integers(40, 200, (SHAPE[0] // 4, SHAPE[1] // 4)).astype(np.uint8)
         self.scene = cv2.resize(coarse, SHAPE[::-1], interpolation=cv2.INTER_LINEAR)
         self.monitor = TileMonitor(np.ones(SHAPE, bool))
-        self._stamp_ns = 0
 
     def images(self, moved_px: int = 0) -> dict[Side, Image]:
         """Return both images."""
@@ -57,9 +53,8 @@ class Cameras:
         }
 
     def update(self, images: dict[Side, Image]) -> TileStates:
-        """Return the states after a pair, 0.1 s after the one before."""
-        self._stamp_ns += 100_000_000
-        return states_after(self.monitor, self._stamp_ns, images, NOISE_GREY)
+        """Return the states after a pair."""
+        return states_after(self.monitor, images, NOISE_GREY)
 
     def _noisy(self, image: Image) -> Image:
         noise = self._noise_grey * self._rng.standard_normal(SHAPE)
@@ -156,23 +151,6 @@ def test_a_part_that_only_one_camera_shows_blurred_is_blind(side: Side) -> None:
     assert states.blind[side][:, INSIDE].all() and not states.unknown[OUTSIDE[1:-1]].any()
 
 
-@pytest.mark.parametrize(("tiles", "is_blind"), [(60, True), (45, False)])
-def test_the_ends_of_a_sector_are_no_neighbours(tiles: int, is_blind: bool) -> None:
-    """Blur at the left end and at the right one, of which too little by itself, is a drop only where the ends meet."""
-    cameras, states = Cameras(), ALL_LIVE
-    cameras.monitor = TileMonitor(np.ones(SHAPE, bool), tiles)
-    side_px = SHAPE[1] // tiles
-    for number in range(IN_A_ROW):
-        images = cameras.images(moved_px=3 * number)
-        smooth = cv2.GaussianBlur(images["lower"], (0, 0), 9).astype(float)
-        noise = np.random.default_rng(number).normal(0, 2, SHAPE)
-        blurred = np.clip(np.rint(smooth + noise), 0, 255).astype(np.uint8)
-        for part in (slice(0, 2 * side_px), slice(SHAPE[1] - 3 * side_px, SHAPE[1])):
-            images["lower"][:, part] = blurred[:, part]
-        states = cameras.update(images)
-    assert bool(states.blind and states.blind["lower"][:, [0, -1]].all()) == is_blind
-
-
 def test_a_small_panorama_of_little_noise_is_live() -> None:
     """In tiles of a few pixels all keep their greys now and then."""
     rng, shape, noise_grey = np.random.default_rng(3), (80, 272), 0.3
@@ -181,7 +159,7 @@ def test_a_small_panorama_of_little_noise_is_live() -> None:
     for number in range(100):
         images = {side: np.rint(scene + noise_grey * rng.standard_normal(shape)).astype(np.uint8) for side in SIDES}
         noise = dict.fromkeys(SIDES, noise_grey)
-        assert states_after(monitor, 100_000_000 * number, images, noise) is ALL_LIVE
+        assert states_after(monitor, images, noise) is ALL_LIVE
 
 
 WIDE = (160, 640)
@@ -189,7 +167,7 @@ EVERYWHERE = np.ones(WIDE, bool)
 
 
 def sums_of(image: NDArray[np.uint8], visible: NDArray[np.bool_] = EVERYWHERE) -> TileSums:
-    return TileSampler(visible).add(image)
+    return TileMonitor(visible).sums("lower", image)
 
 
 def gains_of(lower: NDArray[np.uint8], upper: NDArray[np.uint8], gains: tuple[float, float]) -> tuple[float, float]:
