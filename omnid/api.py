@@ -7,7 +7,6 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -22,7 +21,6 @@ from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
 from omnid.config import Config, load_config, unused_settings
-from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
@@ -69,17 +67,13 @@ def replay(
             rig=rig if rig is None or isinstance(rig, Rig) else Path(rig),
             topics=(lower, upper),
             collect=True,
-            progress=None if progress is None else partial(_report, progress),
+            progress=progress
+            and (lambda run, expected, _: progress(run.newest.seq + 1 if run.newest else 0, expected)),
         )
         result = run_log(Path(log), loaded, options)
     if result.signal:
         signal.raise_signal(result.signal)  # the run has ended in order: now the caller's own handler
     return replace(result, warnings=(*ignored, *result.warnings))
-
-
-def _report(progress: Callable[[int, int | None], object], found: RunStatistics, expected: int | None, _: bool) -> None:
-    """Hand the progress of a run to the caller's function."""
-    progress(0 if found.newest is None else found.newest.seq + 1, expected)
 
 
 class Odometry:

@@ -87,8 +87,8 @@ class RigResult:
         write_rig(Path(path), self.rig)
 
     def save_report(self, path: str | PathLike[str]) -> None:
-        """Write an HTML page with residuals, coverage and panoramas."""
-        write_file(Path(path), rig_report_html(self.calibration, self.images, self.rig, self.angles).encode())
+        """Write an HTML page with residuals and coverage."""
+        write_file(Path(path), rig_report_html(self.calibration, self.images, self.angles).encode())
 
 
 def calibrate_rig(

@@ -1,4 +1,4 @@
-"""The report of a rig's calibration: one self-contained HTML file with three figures."""
+"""The report of a rig's calibration: one self-contained HTML file with a figure of each camera."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import CalibError
 from calib.fit.boards.rig_fit import RigCalibration
 from calib.models.camera import Array, OmniCamera, inside_image
-from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from omnid.calibration.images import SIDES, PairedImages
 from omnid.calibration.live_boards import HOURS, hours_of
@@ -24,10 +22,10 @@ from omnid.report.page import figure, page, table
 
 # Factor by which residuals are drawn longer.
 ARROW = 40.0
-WIDTH_PX = 1400  # of a panorama, or of two cameras side by side
+WIDTH_PX = 1400  # of two cameras side by side
 
 
-def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig, angles: Sequence[Sequence[AngleRow]]) -> str:
+def rig_report_html(found: RigCalibration, images: PairedImages, angles: Sequence[Sequence[AngleRow]]) -> str:
     """Return the page; angles: the tables of the lower and the upper camera."""
     left_out = "".join(
         f"<p class='warn'>left out {escape(bad.name)}: {escape(bad.reason)}</p>" for bad in found.rejected
@@ -40,8 +38,7 @@ def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig, angle
     for name, by_angle in zip(SIDES, angles, strict=True):
         parts += [f"<h2>The {name} camera</h2>", table(HEAD, [row.cells() for row in by_angle])]
     coverage = "".join(_coverage(found, images, side) for side in range(len(SIDES)))
-    figures = ["<h2>Coverage</h2>", f"<div class='tiles wide'>{coverage}</div>", "<h2>Rectified</h2>"]
-    return page("Rig calibration", [*parts, *figures, _rectified(found, images, rig)])
+    return page("Rig calibration", [*parts, "<h2>Coverage</h2>", f"<div class='tiles wide'>{coverage}</div>"])
 
 
 def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
@@ -62,25 +59,6 @@ def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
     cv2.drawMarker(canvas, middle, GREEN, cv2.MARKER_CROSS)
     text = f"all corners; arrows are the residuals, {ARROW:.0f} times as long; the cross is the centre"
     return figure(np.asarray(canvas, np.uint8), f"{SIDES[side]}: {text}")
-
-
-def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
-    """Return the figure of both panoramas of one instant, one above the other, with common columns."""
-    name = next(view.name for view in found.views if None not in view.seen)
-    try:
-        cylinder = fit_cylinder(rig, WIDTH_PX)
-    except CalibError as error:
-        return f"<p class='warn'>{escape(str(error))}</p>"
-    rows = [
-        cv2.remap(side[name], *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
-        for side, mounted in zip(reversed(images.sides), (rig.upper, rig.lower), strict=True)
-    ]
-    canvas = cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR)
-    canvas[:, :: WIDTH_PX // (2 * HOURS)] = GREEN
-    return figure(
-        np.asarray(canvas, np.uint8),
-        f"{name}: the upper panorama above the lower one; a point is in the same column of both",
-    )
 
 
 BIN_DEG: Final = 10

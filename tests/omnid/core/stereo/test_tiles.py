@@ -156,7 +156,7 @@ def test_a_small_panorama_of_little_noise_is_live() -> None:
     rng, shape, noise_grey = np.random.default_rng(3), (80, 272), 0.3
     scene, monitor = np.full(shape, 100.0), TileMonitor(np.ones(shape, bool))
     scene[:, ::9] = 180
-    for number in range(100):
+    for _ in range(100):
         images = {side: np.rint(scene + noise_grey * rng.standard_normal(shape)).astype(np.uint8) for side in SIDES}
         noise = dict.fromkeys(SIDES, noise_grey)
         assert states_after(monitor, images, noise) is ALL_LIVE
