@@ -12,7 +12,6 @@ from difflib import get_close_matches
 from importlib import import_module
 from itertools import dropwhile, takewhile
 from operator import methodcaller
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, cast
 
 from omnid.engine.process import handle_stop_signals
@@ -30,55 +29,51 @@ class Entry(NamedTuple):
 
 
 # Words of each command that has no subcommands -> its entry. A module is imported when its command is named.
-COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
-    {
-        "run": Entry("runs", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
-        "simulate": Entry("runs:simulate", "the daemon with a simulated robot in a simulated world"),
-        "replay": Entry("runs:replay", "run a recorded log through the stages of the daemon"),
-        "demo": Entry("runs:demo", "replay a sample in real time: files, bus and a simulated motor"),
-        "eval": Entry("recordings:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
-        "calibrate live": Entry("calibrate:live", "images of a board, with its coverage and what is missing"),
-        "calibrate rig": Entry("calibrate:of_board", "a rig.toml from images of a board that both cameras saw"),
-        "calibrate drive": Entry("calibrate:drive", "what drives say about a rig, and the rig that they make"),
-        "calibrate import": Entry(
-            "calibrate:import_rig", "a rig.toml from files of other programs, or of two 360-degree cameras"
-        ),
-        "cameras": Entry("machine:show_cameras", "list cameras and the udev rule to copy, or show what they see"),
-        "arm": Entry("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
-        "stop": Entry("robot:stop", "stop the wheels until `omnid arm`; everyone who can connect may"),
-        "drive": Entry("robot:drive", "drive a robot by the keyboard"),
-        "goto": Entry("robot:goto", "drive a robot to a pose, around obstacles"),
-        "route teach": Entry("robot:teach", "record a route while somebody drives (`omnid drive`, a joystick)"),
-        "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
-        "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
-        "route list": Entry("robot:list_routes", "the routes in navigation.routes, here"),
-        "listen": Entry("machine:listen", "show pose, state, rates and latencies of a robot"),
-        "view": Entry("recordings:view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
-        "web": Entry("machine:web", "a page with state, path, warnings, stop and arm"),
-        "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
-        "record": Entry("runs:record", "record both cameras to MCAP files until Ctrl-C"),
-        "report": Entry("recordings:report", "one HTML page about a recording: path, events, statistics"),
-        "log info": Entry("recordings:info", "topics, types, counts, times, attachments, and whether the log is whole"),
-        "map build": Entry("map:build", "build a map from logs, of one drive or of several in the same place"),
-        "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map"),
-        "map export": Entry("map:export", "write a map for other programs"),
-        "map save": Entry("robot:save_map", "ask a robot to save its map now, before it is switched off"),
-        "doctor": Entry("machine:doctor", "check cameras, motor, rig, rights, bus and disk"),
-        "motor test": Entry("machine:test_motor", "turn each wheel, ask what moved, print the settings for that"),
-        "config": Entry("machine:print_config", "print or check settings"),
-        "install-service": Entry("machine:install_service", "install omnid as a systemd service"),
-    }
-)
+COMMANDS: Final[Mapping[str, Entry]] = {
+    "run": Entry("runs", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
+    "simulate": Entry("runs:simulate", "the daemon with a simulated robot in a simulated world"),
+    "replay": Entry("runs:replay", "run a recorded log through the stages of the daemon"),
+    "demo": Entry("runs:demo", "replay a sample in real time: files, bus and a simulated motor"),
+    "eval": Entry("recordings:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
+    "calibrate live": Entry("calibrate:live", "images of a board, with its coverage and what is missing"),
+    "calibrate rig": Entry("calibrate:of_board", "a rig.toml from images of a board that both cameras saw"),
+    "calibrate drive": Entry("calibrate:drive", "what drives say about a rig, and the rig that they make"),
+    "calibrate import": Entry(
+        "calibrate:import_rig", "a rig.toml from files of other programs, or of two 360-degree cameras"
+    ),
+    "cameras": Entry("machine:show_cameras", "list cameras and the udev rule to copy, or show what they see"),
+    "arm": Entry("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
+    "stop": Entry("robot:stop", "stop the wheels until `omnid arm`; everyone who can connect may"),
+    "drive": Entry("robot:drive", "drive a robot by the keyboard"),
+    "goto": Entry("robot:goto", "drive a robot to a pose, around obstacles"),
+    "route teach": Entry("robot:teach", "record a route while somebody drives (`omnid drive`, a joystick)"),
+    "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
+    "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
+    "route list": Entry("robot:list_routes", "the routes in navigation.routes, here"),
+    "listen": Entry("machine:listen", "show pose, state, rates and latencies of a robot"),
+    "view": Entry("recordings:view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
+    "web": Entry("machine:web", "a page with state, path, warnings, stop and arm"),
+    "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
+    "record": Entry("runs:record", "record both cameras to MCAP files until Ctrl-C"),
+    "report": Entry("recordings:report", "one HTML page about a recording: path, events, statistics"),
+    "log info": Entry("recordings:info", "topics, types, counts, times, attachments, and whether the log is whole"),
+    "map build": Entry("map:build", "build a map from logs, of one drive or of several in the same place"),
+    "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map"),
+    "map export": Entry("map:export", "write a map for other programs"),
+    "map save": Entry("robot:save_map", "ask a robot to save its map now, before it is switched off"),
+    "doctor": Entry("machine:doctor", "check cameras, motor, rig, rights, bus and disk"),
+    "motor test": Entry("machine:test_motor", "turn each wheel, ask what moved, print the settings for that"),
+    "config": Entry("machine:print_config", "print or check settings"),
+    "install-service": Entry("machine:install_service", "install omnid as a systemd service"),
+}
 # First word of commands with subcommands -> its line in the list of commands.
-GROUPS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "calibrate": "make a rig.toml",
-        "route": "teach a route by driving it, and repeat it",
-        "log": "show the content of logs",
-        "map": "build, show and export maps of places (.omap)",
-        "motor": "test the wiring of the motors: sides, directions, scale",
-    }
-)
+GROUPS: Final[Mapping[str, str]] = {
+    "calibrate": "make a rig.toml",
+    "route": "teach a route by driving it, and repeat it",
+    "log": "show the content of logs",
+    "map": "build, show and export maps of places (.omap)",
+    "motor": "test the wiring of the motors: sides, directions, scale",
+}
 WRONG_INPUT = 2
 
 
@@ -94,7 +89,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 128 + a signal."""
     # OpenCV reads it when it is loaded: it refuses larger image files; by drivers.frame.MAX_PIXELS, which loads OpenCV.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
-    limit_blas_threads()
+    # numpy reads it when it is loaded: the matrices are small, and threads of BLAS wait for the next one without
+    # sleeping: see the row `libraries` of `OPENBLAS_NUM_THREADS=2 python -m tests.bench.daemon`.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if argv is None else argv)
     if _completes():
         words = os.environ["COMP_LINE"].split()[1:]
@@ -132,15 +129,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         log(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
         _discard_stdout()
         return WRONG_INPUT
-
-
-def limit_blas_threads() -> None:
-    """Let BLAS work with one thread, unless the user wants more; it reads the variable when numpy is loaded.
-
-    The matrices are small, and its threads wait for the next one without sleeping: see the row `libraries` of
-    `OPENBLAS_NUM_THREADS=2 python -m tests.bench.daemon`.
-    """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def parser_of(words: Sequence[str]) -> Parser:

@@ -4,6 +4,6 @@ BLAS has one thread here, as in the commands: its threads wait for the next matr
 the processor time of some tests, and of what benchmarks measure.
 """
 
-from omnid.cli import limit_blas_threads
+import os
 
-limit_blas_threads()  # before numpy is loaded
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded

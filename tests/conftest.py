@@ -13,15 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from omnid.cli import limit_blas_threads
 from omnid.core.compiled import cache_folder, why_unusable
 from omnid.engine.kernel_cache import prepare_kernels
 from tests.replay.command import Command
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 
-# As in the program: more threads of BLAS wait without sleeping, a fifth of the processor time of a calibration.
-limit_blas_threads()
 # Each of the some hundred programs that tests start would compile all its modules again: 0.5 s each.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import scipy
@@ -168,14 +169,9 @@ def project(rig: Rig, camera: Indices, points: Array) -> Array:
     return pixels
 
 
-@dataclass(frozen=True, slots=True)
-class _Jacobians:
-    """Weighted residuals (2 M,) and their derivatives."""
-
-    error: Array  # (2 M,)
-    by_pose: scipy.sparse.csr_matrix  # (2 M, 6 F) by twists of the free keyframes
-    by_steps: Array  # (2 M, P)
-    of_landmarks: Array  # (M, 2, 3) of each observation by its landmark
+# Weighted residuals (2 M,), and their derivatives (2 M, 6 F) by twists of the free keyframes, (2 M, P) by the steps of
+# the rig, and (M, 2, 3) of each observation by its landmark.
+Jacobians: TypeAlias = tuple[Array, scipy.sparse.csr_matrix, Array, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,19 +242,15 @@ class DriveProblem:
 
     def normal_equations(self, state: DriveState, scale: float) -> ArrowSystem:
         """Return the normal equations of poses and rig, with one block for each landmark."""
-        J, seen = self._jacobians(state, scale), self.observations
-        between = J.by_pose.T @ J.by_steps
-        A = np.block(
-            [[(J.by_pose.T @ J.by_pose).toarray(), between], [between.T, J.by_steps.T @ J.by_steps + self.prior]]
-        )
+        error, by_pose, by_steps, of_landmarks = self._jacobians(state, scale)
+        landmark, between = self.observations.landmark, by_pose.T @ by_steps
+        A = np.block([[(by_pose.T @ by_pose).toarray(), between], [between.T, by_steps.T @ by_steps + self.prior]])
         blocks = np.zeros((len(state.points), 3, 3))
-        np.add.at(blocks, seen.landmark, np.swapaxes(J.of_landmarks, 1, 2) @ J.of_landmarks)
-        by_point = _scattered(J.of_landmarks, seen.landmark, len(state.points))
-        coupling = scipy.sparse.vstack(
-            [J.by_pose.T @ by_point, scipy.sparse.csr_matrix((by_point.T @ J.by_steps).T)]
-        ).tocsr()
-        a = np.concatenate([J.by_pose.T @ J.error, J.by_steps.T @ J.error - self.prior @ state.steps])
-        return ArrowSystem(A, coupling, blocks, a, np.asarray(by_point.T @ J.error))
+        np.add.at(blocks, landmark, np.swapaxes(of_landmarks, 1, 2) @ of_landmarks)
+        by_point = _scattered(of_landmarks, landmark, len(state.points))
+        coupling = scipy.sparse.vstack([by_pose.T @ by_point, scipy.sparse.csr_matrix((by_point.T @ by_steps).T)])
+        a = np.concatenate([by_pose.T @ error, by_steps.T @ error - self.prior @ state.steps])
+        return ArrowSystem(A, coupling.tocsr(), blocks, a, np.asarray(by_point.T @ error))
 
     def covariance(self, state: DriveState, scale: float, prior: Array) -> Array:
         """Return the covariance (P, P) of the rig's steps, to whose gradient the prior adds the variance (P, P).
@@ -271,13 +263,13 @@ class DriveProblem:
         system = self.normal_equations(state, scale)
         inverse = np.linalg.inv(system.reduced()[0])
         # 2. Each landmark's share (C, L) in the gradient, the landmark itself eliminated.
-        J, count = self._jacobians(state, scale), len(state.points)
+        (error, by_pose, by_steps, _), count = self._jacobians(state, scale), len(state.points)
         of_landmark = np.repeat(self.observations.landmark, 2)
-        errors = scipy.sparse.csr_matrix((J.error, (np.arange(len(J.error)), of_landmark)), (len(J.error), count))
+        errors = scipy.sparse.csr_matrix((error, (np.arange(len(error)), of_landmark)), (len(error), count))
         own = scipy.sparse.csr_matrix(
             (system.c, (np.arange(3 * count), np.repeat(np.arange(count), 3))), (3 * count, count)
         )
-        shares = np.concatenate([(J.by_pose.T @ errors).toarray(), (errors.T @ J.by_steps).T])
+        shares = np.concatenate([(by_pose.T @ errors).toarray(), (errors.T @ by_steps).T])
         shares = shares - (system.B @ system.inverse_blocks() @ own).toarray()
         # 3. The variance of the gradient between the two inverses.
         P = len(prior)
@@ -285,7 +277,7 @@ class DriveProblem:
         known[-P:, -P:] = prior
         return np.asarray((inverse @ (shares @ shares.T + known) @ inverse)[-P:, -P:])
 
-    def _jacobians(self, state: DriveState, scale: float) -> _Jacobians:
+    def _jacobians(self, state: DriveState, scale: float) -> Jacobians:
         """Return derivatives and residuals in sigmas, with the weights of Cauchy's function."""
         seen, residual = self.observations, self.residuals(state)
         squared = (residual**2).sum(axis=1) / scale**2
@@ -296,12 +288,8 @@ class DriveProblem:
         by_steps = (self._by_steps(state) * root[:, :, None]).reshape(-1, len(self.prior))
         J_poses = _scattered(by_pose, seen.keyframe, len(state.T_rig_odom))
         is_free = np.repeat(~np.isin(np.arange(len(state.T_rig_odom)), self.fixed), 6)
-        return _Jacobians(
-            (residual * root).ravel(),
-            J_poses[:, is_free],
-            by_steps,
-            by_rig_point @ se3.R_of(state.T_rig_odom[seen.keyframe]),
-        )
+        of_landmarks = by_rig_point @ se3.R_of(state.T_rig_odom[seen.keyframe])
+        return (residual * root).ravel(), J_poses[:, is_free], by_steps, of_landmarks
 
     def _by_point(self, steps: Array, points: Array) -> Array:
         """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""

@@ -30,6 +30,7 @@ from omnid.core.odometry.corners import corners
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.semiglobal import MIN_DISPARITY_PX
+from omnid.core.stereo.tiles import TEXTURE_GREY
 from omnid.core.types.panorama import PaddedPanorama, Panoramas
 from omnid.errors import OmnidError
 
@@ -52,9 +53,6 @@ ASIDE_PX, DOWN_PX = 5, 30
 MIN_CORRELATION: Final = 0.8
 # Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than the coarse search errs.
 KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
-# Standard deviation of a coarse patch with contrast, grey levels, because noise alone, averaged over COARSE^2 pixels,
-# has less.
-CONTRAST_GREY: Final = 6.0
 
 # Matches for a finding: ten in each sector of azimuth, so that a tilt and a shift can be distinguished.
 MIN_MATCHES: Final = 120
@@ -161,7 +159,7 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
         _, best, _, (shift, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
         guess[index] += COARSE * (low + shift - left), COARSE * down
         good[index] = best >= MIN_CORRELATION
-        clear += bool(patch.std() > CONTRAST_GREY)
+        clear += bool(patch.std() > TEXTURE_GREY)  # noise alone, averaged over COARSE^2 pixels, has less
     # 2. Track from there, to parts of a pixel.
     there, is_tracked = track(lower, upper, points, guess, KLT)
     # 3. Keep those that stay near the coarse place and lie lower in the upper panorama than in the lower one.
