@@ -109,42 +109,6 @@ class Matcher:
         return self._search.search(lower, upper, pixels, column_shift)
 
 
-class SadVolume:
-    """SAD of every pixel of the lower panorama and the pixel d rows below it in the upper one, d = 0 .. D-1.
-
-    The planes (D, H, W) uint16 are allocated once.
-    """
-
-    def __init__(self, shape: tuple[int, int], disparities: int, window_px: int) -> None:
-        self._window_px = window_px
-        self._planes = np.full((min(disparities, shape[0]), *shape), NO_MATCH, np.uint16)
-
-    def fill(self, lower: Image, upper: Image) -> None:
-        """Compute the planes for a pair of panoramas (H, W)."""
-        for d, plane in enumerate(self._planes):
-            rows = len(lower) - d
-            plane[:rows] = sad(lower[:rows], upper[d:], self._window_px)
-
-    def at(self, pixels: Indices) -> Costs:
-        """Return the costs (D, N) of pixels of the lower panorama (flat indices)."""
-        return np.array([np.take(plane.reshape(-1), pixels, mode="clip") for plane in self._planes])
-
-    def best_from_upper(self, pixels: Indices, disparity: Indices) -> tuple[Indices, Costs]:
-        """Return the best disparities (N,) of the upper panorama's pixels, and their costs (N,): the left-right check.
-
-        The upper pixels are given by pixels (N,) of the lower panorama and their disparities (N,).
-        """
-        width = self._planes.shape[2]
-        upper = pixels + disparity * width
-        best = np.full(len(pixels), NO_MATCH, np.uint16)
-        choice = np.zeros(len(pixels), np.intp)
-        for d, plane in enumerate(self._planes):
-            cost = np.take(plane.reshape(-1), np.maximum(upper - d * width, 0), mode="clip")
-            better = (cost < best) & (upper >= d * width)
-            best[better], choice[better] = cost[better], d
-        return choice, best
-
-
 class ColumnSearch:
     """SAD along the whole column with the left-right check: the lowest one, or one chosen among several candidates.
 
@@ -153,7 +117,8 @@ class ColumnSearch:
 
     def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._matching = matching
-        self._volume = SadVolume(shape, matching.disparities, matching.window_px)
+        # SAD of every pixel of the lower panorama and the pixel d rows below it in the upper one, d = 0 .. D-1.
+        self._planes = np.full((min(matching.disparities, shape[0]), *shape), NO_MATCH, np.uint16)
 
     def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
         """Return the pixels whose match the upper panorama confirms; a column shift is ignored.
@@ -161,8 +126,10 @@ class ColumnSearch:
         Where the lines to anchors decided clearly, the match need only be one of the candidates of the upper pixel:
         repeated bricks mislead the SAD from either side.
         """
-        self._volume.fill(lower, upper)
-        costs = self._volume.at(pixels)
+        for d, plane in enumerate(self._planes):
+            rows = len(lower) - d
+            plane[:rows] = sad(lower[:rows], upper[d:], self._matching.window_px)
+        costs = np.array([np.take(plane.reshape(-1), pixels, mode="clip") for plane in self._planes])
         disparity, lowest = costs.argmin(axis=0), costs.min(axis=0)
         if self._matching.method == "sad":
             kept = _at(local_minima(costs, self._matching.max_cost), disparity)
@@ -179,7 +146,7 @@ class ColumnSearch:
         disparity = propagation.disparity
         # 3. The upper panorama confirms: strictly where the margin to the second candidate was small.
         unclear = ambiguous & ~clear & _at(minima, disparity)
-        _, lowest = self._volume.best_from_upper(pixels[clear], disparity[clear])
+        _, lowest = self._best_from_upper(pixels[clear], disparity[clear])
         kept[clear] = _at(costs, disparity)[clear] <= self._candidate_limit(lowest)
         kept[unclear] = self._is_best_from_upper(pixels[unclear], disparity[unclear])
         return pixels[kept], subpixel(costs, disparity)[kept]
@@ -192,8 +159,23 @@ class ColumnSearch:
 
     def _is_best_from_upper(self, pixels: Indices, disparity: Indices) -> Flags:
         """Return the matches (N,) that are also the best ones of their upper pixels, within LEFT_RIGHT_PX."""
-        choice, _ = self._volume.best_from_upper(pixels, disparity)
+        choice, _ = self._best_from_upper(pixels, disparity)
         return np.asarray(np.abs(choice - disparity) <= LEFT_RIGHT_PX)
+
+    def _best_from_upper(self, pixels: Indices, disparity: Indices) -> tuple[Indices, Costs]:
+        """Return the best disparities (N,) of the upper panorama's pixels, and their costs (N,): the left-right check.
+
+        The upper pixels are given by pixels (N,) of the lower panorama and their disparities (N,).
+        """
+        width = self._planes.shape[2]
+        upper = pixels + disparity * width
+        best = np.full(len(pixels), NO_MATCH, np.uint16)
+        choice = np.zeros(len(pixels), np.intp)
+        for d, plane in enumerate(self._planes):
+            cost = np.take(plane.reshape(-1), np.maximum(upper - d * width, 0), mode="clip")
+            better = (cost < best) & (upper >= d * width)
+            best[better], choice[better] = cost[better], d
+        return choice, best
 
     def _candidates(self, costs: Costs, minima: Flags, count: Indices) -> Candidates:
         """Return the minima of the points with more than one; of too many the lowest. Overwrites minima."""
