@@ -79,8 +79,8 @@ def test_the_report_of_lenses_that_look_ahead_is_written(fitted: tuple[RigCalibr
     found, rig = fitted
     blank = {view.name: np.full(SIZE[::-1], 90, np.uint8) for view in found.views}
     images = PairedImages((blank, blank))
-    page = rig_report_html(found, images, rig, [angle_rows(found, rig, side) for side in (0, 1)])
-    assert page.count("<td>60 to 70 deg</td>") == 2 and page.count("<img") >= 3
+    page = rig_report_html(found, images, [angle_rows(found, rig, side) for side in (0, 1)])
+    assert page.count("<td>60 to 70 deg</td>") == 2 and page.count("<img") == 2
 
 
 @pytest.mark.parametrize("view", ["mirror", "direct"])
