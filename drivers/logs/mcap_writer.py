@@ -18,9 +18,8 @@ from drivers.errors import DriverError
 from drivers.logs.log import LATEST_NS
 from drivers.logs.ros_messages import typestore
 
-_KEPT_TOPICS = ("/tf_static",)  # ROS 2 keeps their newest message for late subscribers, also of `ros2 bag play`
 _FOREVER = "\n    sec: 9223372036\n    nsec: 854775807\n"
-# rosbag2's YAML: keep last, reliable, transient local, automatic liveliness
+# rosbag2's YAML of a topic that is kept for late subscribers: last one, reliable, transient local, automatic liveliness
 _TRANSIENT_LOCAL = (
     f"- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:{_FOREVER}  lifespan:{_FOREVER}"
     f"  liveliness: 1\n  liveliness_lease_duration:{_FOREVER}  avoid_ros_namespace_conventions: false\n"
@@ -90,11 +89,12 @@ class LogWriter:
                 self._note_persisted()
 
     def sync(self) -> None:
-        """End the chunk and write all data to the disk; raise DriverError where that fails."""
+        """End the chunk and write all data to the disk; raise DriverError where that fails, or the file is gone."""
         with self._guarded():
             self._writer.flush()  # type: ignore[no-untyped-call]
             self._note_persisted()
             os.fsync(self._file.fileno())
+            os.stat(self._path)  # it may have been deleted
 
     def close(self) -> None:
         """Write the index, which completes the file, and all data to the disk; may be called twice.
@@ -135,7 +135,7 @@ class LogWriter:
         """Return the channel of a topic and a type."""
         if (topic, schema_name) not in self._channels:
             schema = self._writer.register_schema(schema_name, "ros2msg", _schema_text(schema_name).encode())
-            metadata = {"offered_qos_profiles": _TRANSIENT_LOCAL if topic in _KEPT_TOPICS else ""}
+            metadata = {"offered_qos_profiles": _TRANSIENT_LOCAL if topic == "/tf_static" else ""}
             self._channels[topic, schema_name] = self._writer.register_channel(topic, "cdr", schema, metadata)
         return self._channels[topic, schema_name]
 

@@ -362,15 +362,6 @@ def test_right_headers_are_used_whatever_the_times_of_logging(tmp_path: Path, lo
     assert [frame.stamp_ns for frame in frames if frame.camera == "lower"] == [taken(LOWER, n) for n in range(COUNT)]
 
 
-def test_a_conversion_camera_by_camera_is_ordered_by_headers(tmp_path: Path) -> None:
-    """Its times of logging are those of the conversion, or none."""
-    for logged in (lambda n: 0, lambda n: START_NS + n * 5 * 10**6):
-        written = sorted(entries(right), key=lambda entry: entry.topic)
-        log = [entry._replace(log_time_ns=logged(n)) for n, entry in enumerate(written)]
-        frames, warnings = stamped(write_log(tmp_path / "log.mcap", log))
-        assert shown(frames) == AS_TAKEN and not warnings
-
-
 @pytest.mark.parametrize(("source", "first_ns"), [("header", 5 * S), ("log", START_NS + DELAY_NS), ("auto", 5 * S)])
 def test_the_setting_decides(tmp_path: Path, source: TimeSource, first_ns: int) -> None:
     """A clock that counts from the start of the computer is one as well."""

