@@ -126,13 +126,6 @@ class ShownBins(NamedTuple):
     greys: Floats
     far: Floats  # (DIRECTIONS,) largest step beyond the last bin
 
-    def beyond(self, where: Flags, other: ShownBins) -> ShownBins:
-        """Return what is shown of a floor that is another plane in some bins (N, DIRECTIONS)."""
-        return ShownBins._make(
-            np.where(where if mine.ndim > 1 else where[-1], theirs, mine)
-            for mine, theirs in zip(self, other, strict=True)
-        )
-
 
 def floor_plane(T_rect_floor: Array) -> FloorPlane:
     """Return the floor's plane z = 0 of a level frame, from which T_rect_floor (4, 4) leads to the rectified one."""

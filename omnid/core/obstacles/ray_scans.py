@@ -34,9 +34,9 @@ from omnid.core.obstacles.plane_view import (
     AZIMUTHS,
     BOUNDED_SIGMAS,
     FOCAL_PX,
-    Bins,
     FloorPlane,
     PlaneView,
+    ShownBins,
     WorkingPair,
     floor_plane,
 )
@@ -148,7 +148,6 @@ class RayScans:
         self.grid = ObstacleGrid(FOCAL_PX * baseline_m, settings.max_range_m)
         # Tilt (2,) beyond what the rig states by all pairs, its covariance, and that of the tables.
         self._tilt, self._P, self._used = np.zeros(2), PRIOR_RAD**2 * np.eye(2), np.zeros(2)
-        self._bins: Bins | None = None
         self._followed_ns: int | None = None  # stamp of the last pair by which tilt and ramps were followed
         self._ramp: Ramp | None = None
         self._way = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
@@ -159,9 +158,7 @@ class RayScans:
         self._T_odom_floor = np.eye(4)  # pose of the base when it stood on the floor before a ramp
         self.grid.set_floor(T_rect_base)
         self._ramp = None
-        self._bins = None
-        self._floor = self._on_ramp = self._view(floor_plane(T_rect_base))
-        self._bins = self._floor.bins
+        self._floor = self._on_ramp = self._seen(floor_plane(T_rect_base), None)
 
     def begin_again(self) -> None:
         """Forget what is known in odom, as the way since then is not."""
@@ -199,7 +196,9 @@ class RayScans:
             a, b = floor.a + ramp.slope * math.cos(way_rad), floor.b + ramp.slope * math.sin(way_rad)
             self._on_ramp = self._seen(FloorPlane(floor.height_m + ramp.slope * start_m, a, b), self._on_ramp)
             on_ramp = self._on_ramp.shown(self._on_ramp.pair(lower, upper, lost))
-            shown = shown.beyond(_is_beyond(start_m, way_rad, self._floor.bins.ranges_m), on_ramp)
+            where = _is_beyond(start_m, way_rad, self._floor.bins.ranges_m)
+            both = zip(shown, on_ramp, strict=True)
+            shown = ShownBins(*(np.where(where if of.ndim > 1 else where[-1], theirs, of) for of, theirs in both))
         # 3. The belief, with the look of floor that is known, and the grid.
         known = self.grid.is_floor(pose, self._floor.bins.ranges_m)
         belief = ray_belief(shown, self._floor.bins, pair.sensor_grey, known)
@@ -259,10 +258,11 @@ class RayScans:
         if np.abs((self._tilt - self._used)[is_sure]).max(initial=0.0) > LEAST_RAD:
             self._used = np.where(is_sure, self._tilt, self._used)
 
-    def _view(self, plane: FloorPlane) -> PlaneView:
-        return PlaneView(self._cylinder, self._baseline_m, plane, self._settings, self._visible, self._bins)
-
-    def _seen(self, plane: FloorPlane, before: PlaneView) -> PlaneView:
+    def _seen(self, plane: FloorPlane, before: PlaneView | None) -> PlaneView:
         """Return the view of a plane, that of a plane before where it is about the same."""
-        height_m, *slopes = np.abs(np.subtract(plane, before.plane))
-        return before if height_m < LEAST_M and max(slopes) < LEAST_RAD else self._view(plane)
+        if before is not None:
+            height_m, *slopes = np.abs(np.subtract(plane, before.plane))
+            if height_m < LEAST_M and max(slopes) < LEAST_RAD:
+                return before
+        bins = None if before is None else before.bins
+        return PlaneView(self._cylinder, self._baseline_m, plane, self._settings, self._visible, bins)
