@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_kernels import solve
-from omnid.core.stereo.triangulation import triangulate, view
+from omnid.core.odometry.pose_kernels import POSE, normal_equations
+from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -34,6 +34,11 @@ OUTLIER_SQUARED = 16.0
 # a landmark its texture in successive frames, so that their errors are correlated.
 CORRELATED = 4.0
 DAMPING = 1e-9  # added to the normal equations' diagonal, so that few landmarks do not make them singular
+
+
+def cost(squared: Array | float) -> Array:
+    """Return minus the logarithm of the likelihood of views by their squared distances, by those that count as one."""
+    return np.asarray(KERNEL_WIDTH**2 / 2 * np.log1p(np.asarray(squared) / KERNEL_WIDTH**2) / CORRELATED)
 
 
 def rigid_fit(a: Array, b: Array) -> Array:
@@ -110,28 +115,30 @@ def gauss_newton(
     measures in 3-D and is biased short.
     """
     by_error, of_error = (np.zeros((len(views), 3, 0)), np.zeros((0, 0))) if shared is None else shared
-    size = 6 + len(of_error)
+    size = POSE + len(of_error)
     prior = np.diag(np.full(size, DAMPING))
     if len(of_error):
-        prior[6:, 6:] += np.linalg.inv(of_error)
-    of_corner = model.sigma_px**2 * np.eye(3)
-    S = np.tile(of_corner, (len(views), 1, 1)) if noise is None else np.ascontiguousarray(of_corner + noise)
-    T, error, squared, inverse = np.array(T), np.zeros(size - 6), np.empty(len(views)), np.empty((size, size))
-    landmarks, covariance, views = map(np.ascontiguousarray, (landmarks, covariance, views))
-    solve(
-        landmarks,
-        covariance,
-        views,
-        S,
-        np.ascontiguousarray(by_error),
-        prior,
-        model.camera,
-        KERNEL_WIDTH,
-        steps,
-        CONVERGED,
-        T,
-        error,
-        squared,
-        inverse,
-    )
-    return GaussNewtonResult(T, inverse[:6, :6], squared)
+        prior[POSE:, POSE:] += np.linalg.inv(of_error)
+    # 1. The information of the views, at the start. An upper row that is not known has none.
+    by_landmark = view_jacobian(se3.apply(T, landmarks), model.cylinder, model.baseline_m) @ T[:3, :3]
+    S = by_landmark @ covariance @ np.swapaxes(by_landmark, 1, 2) + model.sigma_px**2 * np.eye(3)
+    S = S if noise is None else S + noise
+    is_lower_only = np.isnan(views[:, 2])
+    S[is_lower_only, 2], S[is_lower_only, :, 2] = 0.0, 0.0
+    S[is_lower_only, 2, 2] = 1.0
+    information = np.asarray(np.linalg.inv(S), float)
+    information[is_lower_only, 2, 2] = 0.0
+    # 2. Steps. If one is short, the last equations hold after it as well.
+    error, squared, inverse = np.zeros(size - POSE), np.empty(len(views)), np.empty((size, size))
+    landmarks, views, by_error, T = map(np.ascontiguousarray, (landmarks, views, by_error, T))
+    for number in range(steps + 1):
+        H, g = prior.copy(), -prior[:, POSE:] @ error
+        normal_equations(landmarks, views, information, by_error, model.camera, KERNEL_WIDTH, T, error, squared, H, g)
+        inverse = np.linalg.inv(H)
+        if number == steps:
+            break
+        step = inverse @ g
+        T, error = se3.exp(step[:POSE]) @ T, error + step[POSE:]
+        if np.abs(step[:POSE]).max() < CONVERGED:
+            break
+    return GaussNewtonResult(T, inverse[:POSE, :POSE], squared)

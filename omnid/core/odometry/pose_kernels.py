@@ -8,105 +8,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
-from omnid.core.odometry.patch_kernels import invert
 
 Array = NDArray[np.float64]
 Camera = tuple[float, float, float, float, float]
 
 VIEW, POSE, ROTATION = 3, 6, 3  # numbers of a view and of a step, and the first one of its rotation
 LEAST_R_M = 1e-9  # from the axis, so that no division is by zero
-SMALL_RAD = 1e-4  # below which the series of a rotation are exact to rounding
 
 
 @compiled(
-    "(f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], UniTuple(f8, 5), f8, i8, f8, "
-    "f8[:, ::1], f8[::1], f8[::1], f8[:, ::1])",
-    writes=("S", "T", "shared", "squared", "inverse"),
+    "(f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], UniTuple(f8, 5), f8, f8[:, ::1], f8[::1], f8[::1], "
+    "f8[:, ::1], f8[::1])",
+    writes=("squared", "H", "g"),
 )
-def solve(
+def normal_equations(
     landmarks: Array,
-    covariance: Array,
     views: Array,
-    S: Array,
+    information: Array,
     derivatives: Array,
-    prior: Array,
     camera: Camera,
     width: float,
-    steps: int,
-    converged: float,
     T: Array,
     shared: Array,
     squared: Array,
-    inverse: Array,
+    H: Array,
+    g: Array,
 ) -> None:
-    """Improve T (4, 4) and the shared error (K,) by steps of Gauss-Newton, until one is short.
+    """Add the views' part of the normal equations H [step; change of the shared error] = g, and write squared errors.
 
-    covariance (N, 3, 3) [m^2] of the landmarks (N, 3); S (N, 3, 3) [px^2] of the views' noise, becomes their
-    information; derivatives (N, 3, K) of the views by the shared error; prior (6 + K, 6 + K): information of [step;
-    shared error]; width: of the Cauchy kernel. Also writes the squared errors (N,) of the views, and the inverse
-    (6 + K, 6 + K) of the last normal equations.
+    information (N, 3, 3) [1/px^2] of the views (N, 3) of landmarks (N, 3); derivatives (N, 3, K) of the views by the
+    shared error (K,); width: of the Cauchy kernel; T (4, 4): the pose, moved on its left by a step. H (6 + K, 6 + K), g
+    (6 + K,), squared (N,).
     """
-    size, parts = len(inverse), range(VIEW)
-    J, e, informed, of_a, step = np.empty((VIEW, size)), np.empty(VIEW), np.empty(VIEW), np.empty(VIEW), np.empty(size)
-    g, by_landmark, of_landmark = np.empty(size), np.empty((VIEW, VIEW)), np.empty((VIEW, VIEW))
-    # 1. The information of the views, at the start. An upper row that is not known has none.
+    size, parts = len(H), range(VIEW)
+    J, e, informed, of_a = np.empty((VIEW, size)), np.empty(VIEW), np.empty(VIEW), np.empty(VIEW)
     for n in range(len(landmarks)):
         write_view(landmarks[n], views[n], T, camera, J, e)
-        for a in parts:
-            for b in parts:
-                by_landmark[a, b] = J[a, 0] * T[0, b] + J[a, 1] * T[1, b] + J[a, 2] * T[2, b]
-        for a in parts:
-            for b in parts:
-                of_landmark[a, b] = 0.0
-                for c in parts:
-                    of_landmark[a, b] += by_landmark[a, c] * covariance[n, c, b]
-        for a in parts:
-            for b in parts:
-                for c in parts:
-                    S[n, a, b] += of_landmark[a, c] * by_landmark[b, c]
-        if math.isnan(views[n, 2]):
-            S[n, 2, :2], S[n, :2, 2], S[n, 2, 2] = 0.0, 0.0, math.inf
-        invert(S[n])
-    for number in range(steps + 1):
-        # 2. The normal equations H [step; change] = g at the pose, and the squared errors of the views.
-        inverse[:] = prior
+        squared[n] = 0.0
+        for row in parts:
+            for k in range(POSE, size):
+                J[row, k] = -derivatives[n, row, k - POSE]
+                e[row] += derivatives[n, row, k - POSE] * shared[k - POSE]
+        for row in parts:
+            informed[row] = 0.0
+            for k in parts:
+                informed[row] += information[n, row, k] * e[k]
+            squared[n] += e[row] * informed[row]
+        weight = 1 / (1 + squared[n] / width**2)
         for a in range(size):
-            g[a] = 0.0
-            for b in range(POSE, size):
-                g[a] -= prior[a, b] * shared[b - POSE]
-        for n in range(len(landmarks)):
-            write_view(landmarks[n], views[n], T, camera, J, e)
-            squared[n] = 0.0
             for row in parts:
-                for k in range(POSE, size):
-                    J[row, k] = -derivatives[n, row, k - POSE]
-                    e[row] += derivatives[n, row, k - POSE] * shared[k - POSE]
-            for row in parts:
-                informed[row] = S[n, row, 0] * e[0] + S[n, row, 1] * e[1] + S[n, row, 2] * e[2]
-                squared[n] += e[row] * informed[row]
-            weight = 1 / (1 + squared[n] / width**2)
-            for a in range(size):
-                g[a] += weight * (J[0, a] * informed[0] + J[1, a] * informed[1] + J[2, a] * informed[2])
+                g[a] += weight * J[row, a] * informed[row]
+                of_a[row] = 0.0
+                for k in parts:
+                    of_a[row] += weight * information[n, row, k] * J[k, a]
+            for b in range(a + 1):
                 for row in parts:
-                    of_a[row] = weight * (S[n, row, 0] * J[0, a] + S[n, row, 1] * J[1, a] + S[n, row, 2] * J[2, a])
-                for b in range(a + 1):
-                    inverse[a, b] += of_a[0] * J[0, b] + of_a[1] * J[1, b] + of_a[2] * J[2, b]
-        for a in range(size):
-            for b in range(a):
-                inverse[b, a] = inverse[a, b]
-        invert(inverse)
-        if number == steps:
-            break
-        # 3. The step. If it is short, the last equations hold after it as well.
-        for a in range(size):
-            step[a] = 0.0
-            for b in range(size):
-                step[a] += inverse[a, b] * g[b]
-        for k in range(POSE, size):
-            shared[k - POSE] += step[k]
-        move(T, step[:ROTATION], step[ROTATION:POSE])
-        if np.abs(step[:POSE]).max() < converged:
-            break
+                    H[a, b] += of_a[row] * J[row, b]
+    for a in range(size):
+        for b in range(a):
+            H[b, a] = H[a, b]
 
 
 @inner
@@ -137,28 +97,3 @@ def write_view(landmark: Array, seen: Array, T: Array, camera: Camera, J: Array,
             z * by_x - x * by_z,
             x * by_y - y * by_x,
         )
-
-
-@inner
-def move(T: Array, t: Array, r: Array) -> None:
-    """Replace T (4, 4) by exp([t; r]) T (Rodrigues)."""
-    squared = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-    angle = math.sqrt(squared)
-    # sin(a) / a, (1 - cos(a)) / a^2, (a - sin(a)) / a^3
-    a, b, c = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
-    if angle > SMALL_RAD:
-        a, b, c = math.sin(angle) / angle, (1 - math.cos(angle)) / squared, (angle - math.sin(angle)) / angle / squared
-    before, parts = T.copy(), range(len(r))
-    for i in parts:
-        T[i, -1] = t[i]
-        for k in range(len(T)):
-            T[i, k] = 0.0 if k < len(r) else t[i]
-        for j in parts:
-            # W = [r]x, W^2 = r r^T - |r|^2 I.
-            k = len(r) - i - j
-            W = 0.0 if i == j else (r[k] if (j - i) % len(r) == 2 else -r[k])
-            WW = r[i] * r[j] - (squared if i == j else 0.0)
-            R = (1.0 if i == j else 0.0) + a * W + b * WW
-            T[i, -1] += (b * W + c * WW) * t[j]
-            for k in range(len(T)):
-                T[i, k] += R * before[j, k]
