@@ -82,7 +82,7 @@ class FrontEnd:
     def image_faults(self) -> list[str]:
         """One line for each way in which the images of a camera are torn or displaced."""
         breaks = self._method.breaks if isinstance(self._method, VisualOdometry) else None
-        return [] if breaks is None else breaks.words
+        return [] if breaks is None else list(breaks.words.values())
 
     def process(self, pair: Panoramas) -> OdometryUpdate:
         """Return the pose at a pair; RigContradictedError where the images contradict the rig."""

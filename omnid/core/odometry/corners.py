@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import at_scale
-from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -25,9 +24,6 @@ MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 
 # Response that noise of one grey level reaches in 1 % of the pixels, as measured. The response grows with the square of
 # the noise.
 NOISE_RESPONSE = 2.5e-5
-# Largest horizontal error of a vertical match, at all scales, because matches err by parts of a pixel at each; a right
-# calibration errs by 0.1 degrees, 0.4 px of 1300 columns.
-CROSS_PX = 0.7
 REACH_PX = 3  # eq. (8): largest distance, in column and in row, of a located pixel from a feature
 
 
@@ -69,29 +65,6 @@ def clear_around(usable: Flags, points: Array) -> Flags:
     return free.astype(bool)
 
 
-def pixels_in_upper(
-    pair: tuple[PaddedPanorama, PaddedPanorama],
-    points: Array,
-    guess: Array,
-    klt: KltSettings,
-    spread_px: Array | float = 0.0,
-) -> Array:
-    """Return pixels (N, 2) in the upper panorama of points (N, 2) of the lower one; NaN without a match.
-
-    guess (N, 2) pixels. A match passes the forward-backward check, lies within CROSS_PX + spread_px (N,) of the
-    guessed column, and lies below the point.
-    """
-    lower, upper = pair
-    finite = np.flatnonzero(np.isfinite(guess).all(axis=1))
-    there, good = track(lower, upper, points[finite], guess[finite], klt)
-    shift = lower.apart(there[:, 0] - guess[finite, 0])
-    largest = CROSS_PX + np.broadcast_to(spread_px, len(points))[finite]
-    good &= (np.abs(shift) < largest) & (there[:, 1] > points[finite, 1])
-    pixels = np.full((len(points), 2), np.nan)
-    pixels[finite[good]] = there[good]
-    return pixels
-
-
 def nearby_disparity(disparity: NDArray[np.float32], points: Array) -> Array:
     """Return the median disparity (N,) of the located pixels within REACH_PX of points (N, 2); NaN where there is none.
 
@@ -101,12 +74,6 @@ def nearby_disparity(disparity: NDArray[np.float32], points: Array) -> Array:
     offsets = np.arange(-REACH_PX, REACH_PX + 1)
     columns = (np.rint(points[:, 0]).astype(int)[:, None, None] + offsets[None, None, :]) % width
     rows = np.clip(np.rint(points[:, 1]).astype(int)[:, None, None] + offsets[None, :, None], 0, height - 1)
-    around = disparity[rows, columns].reshape(len(points), len(offsets) ** 2)
-    return _nanmedian(around)
-
-
-def _nanmedian(values: NDArray[np.float32]) -> Array:
-    """Return the lower median (N,) of the numbers in each row of (N, K); NaN where there are none."""
-    ordered = np.sort(values, axis=1)  # NaN last
-    count = np.isfinite(ordered).sum(axis=1)
-    return np.asarray(ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2], float)
+    around = np.sort(disparity[rows, columns].reshape(len(points), len(offsets) ** 2), axis=1)  # NaN last
+    count = np.isfinite(around).sum(axis=1)
+    return np.asarray(around[np.arange(len(points)), np.maximum(count - 1, 0) // 2], float)

@@ -23,6 +23,7 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.patch_kernels import correlate
+from omnid.core.odometry.tracking import padded
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ def contradicted(
     chosen = np.flatnonzero(shown & (np.abs(seen[:, 1] - height / 2) < height))
     # 2. The correlations of both hypotheses there; they are one where the point has not moved in the image.
     now, there, here = (
-        np.column_stack([panorama.padded(at[chosen, 0]), at[chosen, 1]])
+        padded(panorama, at[chosen])
         for panorama, at in ((lower, pixels), (earlier.lower, seen), (earlier.lower, pixels))
     )
     of_world, of_rig = np.empty((2, len(chosen)))

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from omnid.core.odometry.exposure_times import NOTHING_ASSUMED, AssumedMotion, Exposure
+from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure, RigVelocity
 from omnid.core.odometry.stereo_frame import Features
 from omnid.errors import OmnidError
 from omnid.tracking_state import TrackingState
@@ -23,7 +23,7 @@ class OdometryLimits:
     refresh: float = 0.9  # a keyframe is added when less than this share of the last one's landmarks is left
     # Defaults of times lie in the middle between two pairs at 10 Hz, so that the jitter of stamps changes nothing.
     sparse_s: float = 0.45  # time after which a keyframe is added where the features wanted are not reached, s
-    keyframes: Annotated[int, Meta(ge=1, le=50), "keyframes in the local map; 1: frame to frame"] = 8
+    keyframes: Annotated[int, Meta(ge=2, le=50), "keyframes in the local map"] = 8
     min_inliers: int = 20  # inliers below which a pose is refused
     # inliers, as a share of the tracked landmarks, below which a pose is refused; likewise those that the upper
     # camera shows, as a share of the inliers
@@ -76,9 +76,11 @@ class PoseEstimate:
     landmarks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (M,) rows of the local map
     views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) px of them at the stamp, NaN: not in upper
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px of them in the lower panorama
-    variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
+    variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
-    assumed: AssumedMotion = NOTHING_ASSUMED  # motion by which the disparities were corrected
+    # (M, K) px by m/s and rad/s: derivatives of the disparities by the velocity, and the one that was assumed.
+    by_motion: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    assumed: RigVelocity = NO_VELOCITY
     # Mean cost of a landmark in view: half of the Cauchy kernel's value, by the landmarks that count as one.
     cost: float = 0.0
     in_view: int = 0  # landmarks by which it is meant
@@ -92,6 +94,10 @@ class PoseEstimate:
     def inlier_ratio(self) -> float:
         """Share of the tracked landmarks that are inliers."""
         return self.inliers / max(1, self.tracked)
+
+    def has_support(self, limits: OdometryLimits) -> bool:
+        """True if the pose has enough inliers in both cameras."""
+        return self.inliers >= limits.min_inliers and self.least_ratio >= limits.min_inlier_ratio
 
     @property
     def least_ratio(self) -> float:

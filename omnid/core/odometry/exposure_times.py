@@ -8,7 +8,7 @@ so that all else works with views of one instant. Its error is that of V, which 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -43,22 +43,6 @@ class RigVelocity:
 
 # Velocity of synchronised frames: it needs no components, because no view depends on it.
 NO_VELOCITY = RigVelocity(np.zeros(0), np.zeros((0, 0)))
-
-
-class AssumedMotion(NamedTuple):
-    """The velocity of K components for which views were corrected, and their derivatives by it."""
-
-    velocity: RigVelocity
-    derivatives: Array  # (N, K) px of the disparities, or (N, 3, K) px of the views
-
-    @property
-    def is_final(self) -> bool:
-        """True if no velocity that is found later changes the views."""
-        return len(self.velocity.twist) == 0
-
-
-# Of views that need no correction.
-NOTHING_ASSUMED = AssumedMotion(NO_VELOCITY, np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,13 +167,10 @@ class Exposure:
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         shifts = [cylinder.wrap(self.upper_columns(grid, grid[:, 1] + d)[0] - grid[:, 0]) for d in near]
         slope = (shifts[1] - shifts[0]) / (near[1] - near[0])
-        whole, mode = (len(columns) * grid_px, len(rows) * grid_px), self._padding
+        whole = len(columns) * grid_px, len(rows) * grid_px
+        mode: Literal["wrap", "edge"] = "wrap" if cylinder.width == cylinder.turn_px else "edge"
         fields = [
             cv2.resize(np.nan_to_num(field).astype(np.float32).reshape(len(rows), len(columns)), whole)
             for field in (shifts[0] - slope * near[0], slope)
         ]
         return ColumnShift(*(np.pad(f[: shape[0], : shape[1]], ((0, 0), (pad_px, pad_px)), mode=mode) for f in fields))
-
-    @property
-    def _padding(self) -> Literal["wrap", "edge"]:
-        return "wrap" if self.model.cylinder.width == self.model.cylinder.turn_px else "edge"

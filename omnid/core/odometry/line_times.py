@@ -26,18 +26,17 @@ from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.pose_estimation import CORRELATED, KERNEL_WIDTH
+from omnid.core.odometry.pose_kernels import VIEW
 from omnid.core.stereo.triangulation import view, view_jacobian
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 LAG_S: Final = 0.003  # standard deviation of the time between the exposures of two cameras that are triggered together
 LEAST_PX: Final = 0.5  # least displacement of a part of an image against the rest: less harms no pose
 MEMORY_S: Final = 1.0  # time constant with which old evidence decays: vehicles change their motion more often
 EVERY_S: Final = 0.04  # least time between two pairs that are used: nearer ones show the same motion
 CAMERAS: Final = ("lower", "upper")
-VIEW_DIMENSIONS: Final = 3  # of a landmark: column, row in the lower and row in the upper panorama
 LAG: Final = 2  # the unknown behind the times of the lower and the upper camera
 SETS: Final = ((0,), (1,), (0, 1))  # cameras whose images are wrong in one way
 
@@ -56,7 +55,9 @@ class RawImage:
 
     def at(self, pixels: Array) -> tuple[Array, Array]:
         """Return raw pixels (N, 2) of pixels (N, 2), NaN: none, and the derivatives (N, 2, 2) of pixels by raw ones."""
-        column, row = self._nearest(pixels)
+        height, width = self._maps[0].shape
+        column, row = np.rint(pixels).astype(np.intp).T
+        column, row = np.clip(column, 2, width - 3), np.clip(row, 2, height - 3)
         raw = np.column_stack([table[row, column] for table in self._maps]).astype(float)
         across = np.column_stack([table[row, column + 2] - table[row, column - 2] for table in self._maps]) / 4.0
         down = np.column_stack([table[row + 2, column] - table[row - 2, column] for table in self._maps]) / 4.0
@@ -65,18 +66,6 @@ class RawImage:
         determinant = np.where(is_shown, determinant, 1.0)
         adjugate = np.array([[down[:, 1], -down[:, 0]], [-across[:, 1], across[:, 0]]])
         return np.where(is_shown[:, None], raw, np.nan), np.moveaxis(adjugate / determinant, 2, 0)
-
-    def row_shares(self, pixels: Array) -> Array:
-        """Return the raw rows (N,) of pixels (N, 2) as shares of the image from its middle on, NaN: none."""
-        column, row = self._nearest(pixels)
-        v = self._maps[1][row, column]
-        return np.where(v >= 0, v / self.size[1] - 0.5, np.nan)
-
-    def _nearest(self, pixels: Array) -> tuple[Indices, Indices]:
-        """Return columns and rows (N,) of the nearest pixels with two neighbours to all sides."""
-        height, width = self._maps[0].shape
-        column, row = np.rint(pixels).astype(np.intp).T
-        return np.clip(column, 2, width - 3), np.clip(row, 2, height - 3)
 
 
 class ReadOut(NamedTuple):
@@ -155,7 +144,7 @@ class LineTimes:
         # A prior of a metre and a radian of each pose: a keyframe with one or two landmarks leaves next to nothing.
         of_d, across = total[:, :6, :6] + np.eye(6), total[:, :6, 6:]
         reduced = (total[:, 6:, 6:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(of_d, across)).sum(axis=0)
-        unit = max(1.0, float(squared.mean()) / VIEW_DIMENSIONS)
+        unit = max(1.0, float(squared.mean()) / VIEW)
         # 5. The sum over time. Where the view hardly moves, patches err as in the pair before: a sample is independent
         #    after a motion of one pixel.
         self._px_per_s = float(np.median(np.linalg.norm(moved[usable][:, :2], axis=1)))
@@ -169,7 +158,7 @@ class LineTimes:
         information[LAG, LAG] += LAG_S**-2
         information -= np.outer(information[:, LAG], information[LAG]) / information[LAG, LAG]
         best: ReadOut | None = None
-        cost = 0.5 * math.log(1.0 + VIEW_DIMENSIONS * self._views) + math.log(len(SETS))
+        cost = 0.5 * math.log(1.0 + VIEW * self._views) + math.log(len(SETS))
         for cameras in SETS:
             A, b = float(information[np.ix_(cameras, cameras)].sum()), float(information[list(cameras), -1].sum())
             found = ReadOut(cameras, b / A, b**2 / (2 * A) - cost) if A > 0 else None
@@ -186,6 +175,7 @@ class LineTimes:
         motion = -(J @ (velocity[..., :3] + np.cross(velocity[..., 3:], points))[:, :, None])[:, :, 0]
         seen, times = view(points, self._model.cylinder, self._model.baseline_m), np.zeros((len(points), 3, LAG + 1))
         for camera, of_view in enumerate((slice(0, 2), slice(2, 3))):
-            times[:, of_view, camera] = self._raws[camera].row_shares(seen[:, [0, 1 + camera]])[:, None]
+            raw, _ = self._raws[camera].at(seen[:, [0, 1 + camera]])
+            times[:, of_view, camera] = raw[:, 1:] / self._raws[camera].size[1] - 0.5
         times[:, 2, LAG] = 1.0
         return motion[:, :, None] * times, motion

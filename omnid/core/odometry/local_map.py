@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import MIN_RADIUS
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import AssumedMotion, RigVelocity
+from omnid.core.odometry.exposure_times import RigVelocity
 from omnid.core.odometry.plane_patches import REACH_PX, AlignedPatches, align, moved_slopes, plane_templates
-from omnid.core.odometry.pose_estimation import CORRELATED
+from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from omnid.core.types.panorama import PaddedPanorama
@@ -32,7 +32,6 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used, so that 0.3 % of right ones are
 COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level, few because the patches are aligned afterwards.
 # Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked.
 EDGE_ROWS = 3
@@ -71,8 +70,9 @@ class NewLandmarks:
     pixels: Array  # (N, 2) px in the lower panorama
     views: Array  # (N, 3) px, at the stamp
     slopes: Array  # (N, 2) px/px of the disparity
-    noise: Array  # (N, 3, 3) px^2 of the views, that of the motion left out
-    assumed: AssumedMotion  # motion by which the views were corrected
+    noise: Array  # (N, 3, 3) px^2 of the views, in addition to that of the model; that of the motion left out
+    by_motion: Array  # (N or 1, 3, K) px by m/s and rad/s: derivatives of the views by the velocity
+    assumed: RigVelocity  # by which the views were corrected
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,91 +105,74 @@ class LocalMap:
         self.keyframes: dict[int, Keyframe] = {}
         self._set_rows(np.zeros(0, LANDMARK))
         self.last: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
-        # What waits for the velocity at its frame: an estimate with the ids of its landmarks, and new landmarks.
+        # What waits for the velocity at its frame, with the ids of its landmarks: an estimate, and new landmarks.
         self._seen: tuple[Indices, PoseEstimate] | None = None
         self._added: tuple[Indices, NewLandmarks] | None = None
 
-    def add_keyframe(
-        self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
-    ) -> Indices:
+    def add_keyframe(self, keyframe: Keyframe, located: NewLandmarks) -> Flags:
         """Add a keyframe at the last panorama with new landmarks, and remove one beyond the bound.
 
-        views (N, 3) [px]: those of the landmarks. slopes (N, 2): those of the disparity. noise: covariance (N, 3, 3)
-        [px^2] of the views in addition to that of the model; None: none. pixels (N, 2): those in the keyframe's
-        panorama, which differ from the views where it was exposed at several times; None: those of the views.
-        Return the ids (N,) of the landmarks; -1 for views that cannot be triangulated, which are left out.
+        Return flags (N,) of those that can be triangulated; the others are left out.
         """
         self.last = keyframe.lower
-        finite = np.isfinite(triangulate(views, self._model.cylinder, self._model.baseline_m)).all(axis=1)
+        points = triangulate(located.views, self._model.cylinder, self._model.baseline_m)
+        finite = np.asarray(np.isfinite(points).all(axis=1))
         new = np.zeros(int(finite.sum()), LANDMARK)
         new["id"] = np.arange(self._next_id, self._next_id + len(new))
         self._next_id += len(new)
-        new["anchor"], new["slopes"] = keyframe.seq, slopes[finite]
-        new["pixels"] = new["anchor_pixels"] = (views[:, :2] if pixels is None else pixels)[finite]
+        new["anchor"], new["slopes"] = keyframe.seq, located.slopes[finite]
+        new["pixels"] = new["anchor_pixels"] = located.pixels[finite]
         self.keyframes[keyframe.seq] = keyframe
         self._set_rows(np.concatenate([self._rows, new]))
-        self.set_views(new["id"], views[finite], None if noise is None else noise[finite])
+        ids = np.full(len(finite), -1)
+        ids[finite] = new["id"]
+        self._set_views(ids, located, located.assumed)
+        self._added = (ids, located) if located.by_motion.shape[2] else None
         if len(self.keyframes) > self._max_keyframes:
             counts = {seq: int((self._rows["anchor"] == seq).sum()) for seq in self.keyframes}
             others, half = counts.keys() - {keyframe.seq}, len(self._rows) / 2
             self.keyframes.pop(min(others, key=lambda seq: (counts[seq] > half, seq)))
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
-        given = np.full(finite.shape, -1)
-        given[finite] = new["id"]
-        return given
+        return finite
 
-    def add_located(self, keyframe: Keyframe, new: NewLandmarks) -> Indices:
-        """Add a keyframe with located landmarks, which are corrected once the velocity is known; return their ids."""
-        motion, J = new.assumed
-        noise = new.noise + J @ motion.covariance @ np.swapaxes(J, 1, 2)
-        ids = self.add_keyframe(keyframe, new.views, new.slopes, noise, new.pixels)
-        self._added = None if new.assumed.is_final else (ids, new)
-        return ids
+    def _set_views(self, ids: Indices, located: NewLandmarks, velocity: RigVelocity) -> None:
+        """Set the positions of landmarks (ids (N,); -1, or those that have left: none) by their views in the anchors.
 
-    def accept(self, lower: PaddedPanorama, estimate: PoseEstimate) -> None:
-        """Record the inliers of an accepted pose, and correct depths, at once or when the velocity is known."""
-        if estimate.assumed.is_final:
-            disparity = estimate.views[:, 2] - estimate.views[:, 1]
-            self.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
-        else:
-            self._seen = self.table.id[estimate.landmarks], estimate
-        self.update_tracked(lower, estimate.landmarks, estimate.pixels)
+        Where a view cannot be triangulated the landmark stays as it is.
+        """
+        J = located.by_motion
+        views = located.views + J @ (velocity.twist - located.assumed.twist)
+        noise = located.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2)
+        points = triangulate(views, self._model.cylinder, self._model.baseline_m)
+        chosen = np.isfinite(points).all(axis=1) & np.isin(ids, self.table.id)
+        camera = self._model.cylinder, self._model.baseline_m, self._model.sigma_px
+        covariance = point_covariance(points[chosen], *camera, noise[chosen])
+        self._place(np.searchsorted(self.table.id, ids[chosen]), points[chosen], covariance)
 
     def settle(self, velocity: RigVelocity | None) -> None:
         """Correct the map by what waits, with the velocity at that frame; None: no better one than was assumed."""
         if self._added is not None and velocity is not None:
-            ids, new = self._added
-            assumed, J = new.assumed
-            views = new.views + J @ (velocity.twist - assumed.twist)
-            noise = new.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2)
-            self.set_views(ids, views, noise)
+            self._set_views(*self._added, velocity)
         if self._seen is not None:
             ids, estimate = self._seen
-            assumed, J = estimate.assumed
-            known = assumed if velocity is None else velocity
-            disparity = estimate.views[:, 2] - estimate.views[:, 1] + J @ (known.twist - assumed.twist)
-            variance = estimate.variance + np.einsum("ni,ij,nj->n", J, known.covariance, J)
-            rows, kept = self.rows(ids)
-            self.update_depths(rows, disparity[kept], variance[kept], estimate.T_odom_rect)
+            kept = np.isin(ids, self.table.id)
+            self._correct(np.searchsorted(self.table.id, ids[kept]), estimate, kept, velocity or estimate.assumed)
         self._seen = self._added = None
 
-    def rows(self, ids: Indices) -> tuple[Indices, Flags]:
-        """Return the rows (M,) of those landmarks that are still kept, and which (N,) of the ids these are."""
-        rows = np.searchsorted(self.table.id, ids)
-        known = np.isin(ids, self.table.id)
-        return rows[known], known
+    def accept(self, lower: PaddedPanorama, estimate: PoseEstimate) -> None:
+        """Record the inliers of an accepted pose, and correct depths, at once or when the velocity is known."""
+        if estimate.by_motion.shape[1]:
+            self._seen = self.table.id[estimate.landmarks], estimate
+        else:
+            self._correct(estimate.landmarks, estimate, np.ones(len(estimate.landmarks), bool), estimate.assumed)
+        self.update_tracked(lower, estimate.landmarks, estimate.pixels)
 
-    def set_views(self, ids: Indices, views: Array, noise: Array | None) -> None:
-        """Set the views (N, 3) [px] of landmarks (ids) in their anchors, and their noise as in `add_keyframe`.
-
-        Where a view cannot be triangulated the landmark stays as it is; those that have left the map are ignored.
-        """
-        rows, known = self.rows(ids)
-        points = triangulate(views[known], self._model.cylinder, self._model.baseline_m)
-        finite = np.isfinite(points).all(axis=1)
-        camera = self._model.cylinder, self._model.baseline_m, self._model.sigma_px
-        noise = None if noise is None else noise[known][finite]
-        self._place(rows[finite], points[finite], point_covariance(points[finite], *camera, noise))
+    def _correct(self, rows: Indices, estimate: PoseEstimate, kept: Flags, velocity: RigVelocity) -> None:
+        """Correct depths of landmarks (rows of the table) by the views in an estimate that are kept (flags (M,))."""
+        J, views = estimate.by_motion[kept], estimate.views[kept]
+        disparity = views[:, 2] - views[:, 1] + J @ (velocity.twist - estimate.assumed.twist)
+        variance = estimate.variance[kept] + np.einsum("ni,ij,nj->n", J, velocity.covariance, J)
+        self.update_depths(rows, disparity, variance, estimate.T_odom_rect)
 
     def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:
         """Correct the points of landmarks (rows (M,) of the table) by disparities (M,) [px] measured at a pose.
@@ -225,9 +208,9 @@ class LocalMap:
         table.covariance[rows] = R @ covariance @ np.swapaxes(R, 1, 2)
 
     def update_tracked(self, lower: PaddedPanorama, rows: Indices, pixels: Array) -> None:
-        """Record the inliers (rows of the table) of an accepted panorama with their pixels (M, 2).
+        """Record in which pixels (M, 2) of a panorama landmarks (rows of the table) were found.
 
-        Landmarks that were no inliers in max_misses consecutive frames are removed.
+        Landmarks that were not found in max_misses consecutive frames are removed.
         """
         table, self.last = self.table, lower
         table.pixels[:] = np.nan
@@ -237,9 +220,9 @@ class LocalMap:
         if (table.misses >= self._max_misses).any():
             self._select(table.misses < self._max_misses)
 
-    def keep(self, ids: Indices) -> None:
-        """Remove all landmarks but these."""
-        self._select(np.isin(self.table.id, ids))
+    def remove(self, rows: Indices) -> None:
+        """Remove landmarks (rows of the table)."""
+        self._select(~np.isin(np.arange(len(self)), rows))
 
     def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
         """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""

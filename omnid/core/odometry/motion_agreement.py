@@ -125,8 +125,8 @@ class MotionAgreement:
         """Return the sensor that differs, and whether it is a fault, by steps (N,) of the cameras."""
         # 1. Each sensor against the images; for the wheels the worse one of distance and turn counts.
         lagged = starts - LAGS_S[:, None], ends - LAGS_S[:, None]
-        wheels_by_lag = self._motion.motion(WheelSample, *lagged)
-        gyro_by_lag = self._motion.motion(GyroSample, *lagged)[..., 2]
+        wheels_by_lag = self._motion.sensors.motion(WheelSample, *lagged, self._motion.values)
+        gyro_by_lag = self._motion.sensors.motion(GyroSample, *lagged, self._motion.values)[..., 2]
         spans = starts, ends, ways
         distance = _finding(spans, ways, wheels_by_lag[..., 0], LEAST_M, is_distance=True)
         of_wheels = _finding(spans, turns, wheels_by_lag[..., 1], WHEEL_TURN_RAD)
@@ -162,7 +162,8 @@ class MotionAgreement:
         now_s, newest = float(ends[-1]), ends > ends[-1] - STILL_S
         if starts[0] > now_s - STILL_S:
             return False
-        by_wheels = self._motion.motion(WheelSample, np.array(now_s - STILL_S), np.array(now_s - LAG_STEP_S))
+        start_s, end_s = np.array(now_s - STILL_S), np.array(now_s - LAG_STEP_S)
+        by_wheels = self._motion.sensors.motion(WheelSample, start_s, end_s, self._motion.values)
         by_images = np.array([ways[newest].sum(), turns[newest].sum()])
         # Wheels without samples (NaN) count as at rest.
         return not any((np.abs(each) > (STILL_M, STILL_RAD)).any() for each in (by_images, by_wheels))

@@ -41,7 +41,6 @@ VELOCITY, ACCELERATION, SENSORS, POSE, SIZE = slice(0, 6), slice(6, 12), slice(1
 # Measured: with 0.67 and 1.5 times as much the odometry errs 0.98 to 1.01 times as much, but for one log at 1152 px
 JERK_PSD = (10.0, 40.0)
 START_SPEED_SIGMA = 1.0  # m/s and rad/s, of a motion that is not known yet
-MIN_VELOCITY_VARIANCE = 1e-10  # added to each measurement, so that its covariance can be inverted
 # Standard deviation of the velocity while nothing measures it, m/s and rad/s: indoor vehicles are seldom twice as fast.
 UNKNOWN_SPEED_SIGMA = 0.5
 SLOWING_S = 0.3  # time constant of the predicted velocity's decay meanwhile
@@ -161,8 +160,7 @@ class MotionFilter:
 
         The measured velocity is the motion over its time.
         """
-        R = covariance / dt_s**2 + MIN_VELOCITY_VARIANCE * np.eye(6)
-        self._filter.update(se3.log(T_prev_curr)[:, None] / dt_s, R=R)
+        self._filter.update(se3.log(T_prev_curr)[:, None] / dt_s, R=covariance / dt_s**2)
         self._symmetrise()
         return se3.exp(self.velocity * dt_s)
 
@@ -199,26 +197,20 @@ class MotionFilter:
         return se3.exp(self.velocity * dt_s) if twist else T_prev_curr, is_complete
 
     def accept(
-        self,
-        T_prev_curr: Array,
-        covariance: Array,
-        dt_s: float,
-        *,
-        interval_s: tuple[float, float] | None,
-        is_sure: bool,
+        self, T_prev_curr: Array, covariance: Array, dt_s: float, interval_s: tuple[float, float] | None
     ) -> RigVelocity:
         """Update the filter with the step that the cameras found (eq. 11), with its covariance (6, 6).
 
-        is_sure: the sensors are compared with it. Returns the velocity at the pair before the step, from the steps
-        around it. A velocity that changes evenly is exact there; how far it changes unevenly in a step, no step shows.
+        interval_s: as in `step`; the sensors are compared with the cameras in it. None: they are not. Returns the
+        velocity at the pair before the step, from the steps around it. A velocity that changes evenly is exact there;
+        how far it changes unevenly in a step, no step shows.
         """
         # 1. The cameras, and then the sensors, each if it agrees.
-        is_compared = is_sure and interval_s is not None
-        if is_compared:
+        if interval_s is not None:
             self._filter.x, self._filter.P = self._before_sensing
         self.update(T_prev_curr, covariance, dt_s)
-        if is_compared:
-            self._compare(interval_s or (0.0, 0.0), dt_s)
+        if interval_s is not None:
+            self._compare(interval_s, dt_s)
         # 2. The velocity at the pair before.
         now, before, self._last_step = self.of_step(T_prev_curr, dt_s), self._last_step, (T_prev_curr, dt_s)
         if before is None:
@@ -227,10 +219,6 @@ class MotionFilter:
         at_previous = (before_s * now.twist + dt_s * before_rate) / (before_s + dt_s)
         uneven = np.diag(((now.twist - before_rate) / 2) ** 2)
         return RigVelocity(at_previous, covariance / (2 * dt_s**2) + uneven)
-
-    def motion(self, sensor: type[MotionSample], starts_s: Array, ends_s: Array) -> Array:
-        """Return the motion by a sensor between times: see MotionSensors.motion."""
-        return self.sensors.motion(sensor, starts_s, ends_s, self.values)
 
     def found(self, covariance: Array) -> None:
         """Set the covariance (6, 6) of a pose that the cameras have found."""

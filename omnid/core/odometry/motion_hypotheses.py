@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.correlation import normalised_patches
 from omnid.core.odometry.estimates import SAME_M, PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.tracking import PEAKS
+from omnid.core.odometry.patch_kernels import MIN_CONTRAST
+from omnid.core.odometry.tracking import PEAKS, normalised_patches
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
@@ -48,7 +48,6 @@ MOST_STEPS = 12  # to each side; a wider reach is searched in wider steps
 # Share of the mean correlation at the pose that another peak must reach: textures that do not repeat stay below 0.37 of
 # it on rendered logs, identical bricks reach 0.62 and more.
 PEAK_SHARE = 0.5
-MIN_PATCH_GREY = 1.0  # standard deviation of a patch with texture; noise has less
 
 
 class OtherMotion:
@@ -85,8 +84,8 @@ class OtherMotion:
         chosen = min(likely, key=lambda each: each.distance_m(T_predicted))
         # 2. The candidate farthest from it is the other motion.
         if self.is_open and chosen.distance_m(T_predicted) > REACH_SIGMAS * sigma_mps * dt_s:
-            self._past, self._displacement = self._past + self._displacement, np.zeros(6)
-            self.velocity = np.zeros(3)
+            self.agree()
+            self.is_open = True
         others = [each for each in likely if each.distance_m(chosen.T_odom_rect) > SAME_M]
         if others:
             off_m = self._displacement[:3] - chosen.T_odom_rect[:3, 3]
@@ -96,7 +95,7 @@ class OtherMotion:
             self.predict(dt_s)
             self._missed += 1
             if self._missed >= MOST_MISSED:
-                self.is_open, self._displacement, self.velocity = False, np.zeros(6), np.zeros(3)
+                self._end()
         # 3. Of estimates of the same pose the one with most inliers.
         same = [each for each in candidates if each.distance_m(chosen.T_odom_rect) <= SAME_M]
         return max(same, key=lambda each: each.inliers)
@@ -107,8 +106,11 @@ class OtherMotion:
 
     def agree(self) -> None:
         """End the doubt: wheels measure the step, whatever was made before."""
-        self._past, self._displacement = self._past + self._displacement, np.zeros(6)
-        self.is_open, self.velocity = False, np.zeros(3)
+        self._past = self._past + self._displacement
+        self._end()
+
+    def _end(self) -> None:
+        self.is_open, self._displacement, self.velocity = False, np.zeros(6), np.zeros(3)
 
     def add(self, T_published: Array, T_other: Array, dt_s: float) -> None:
         """Add a step to another pose than the published one, which was made in dt_s."""
@@ -143,7 +145,7 @@ def displacements(
     steps = math.ceil(reach_m / step_m)
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
     patches, contrast = normalised_patches(before, np.rint(table.pixels[rows]), SAMPLES, SAMPLE_PX, _blurred(before))
-    textured = contrast > MIN_PATCH_GREY
+    textured = contrast > MIN_CONTRAST
     if not textured.any():
         return []
     # 2. Their mean correlation with the current one.

@@ -55,32 +55,28 @@ class RateHistory:
         rates = np.concatenate([table[:, 1:], self._rates])[first]
         self._times, self._rates = times[-MOST_SAMPLES:], rates[-MOST_SAMPLES:]
 
+    def at(self, times_s: Array) -> Array:
+        """Return the rates (..., size) at times."""
+        return np.stack([np.interp(times_s, self._times, each) for each in self._rates.T], axis=-1)
+
     def integrals(self, starts_s: Array, ends_s: Array) -> Array:
         """Return the integrals (..., size) of the rates over intervals; NaN where the samples leave a gap."""
         if not len(self._times):
             return np.full((*np.shape(starts_s), self._rates.shape[1]), np.nan)
-        # 1. Integrals up to each sample, and the number of gaps before it.
-        times = np.append(self._times, self._times[-1] + LONGEST_GAP_S)
-        rates = np.concatenate([self._rates, self._rates[-1:]])
-        steps = np.diff(times)
-        areas = (rates[1:] + rates[:-1]) / 2 * steps[:, None]
+        # 1. Integrals up to all samples, starts and ends, between which rates are linear.
+        grid = np.unique(np.concatenate([self._times, np.ravel(starts_s), np.ravel(ends_s)]))
+        rates = self.at(grid)
+        areas = (rates[1:] + rates[:-1]) / 2 * np.diff(grid)[:, None]
         totals = np.concatenate([np.zeros((1, rates.shape[1])), np.cumsum(areas, axis=0)])
-        gaps = np.append(0, np.cumsum(steps[:-1] > LONGEST_GAP_S))
-        # 2. Those up to the start and the end. Rounding makes no gap after the last sample.
-        at_ends = []
-        for when in (starts_s, ends_s):
-            k = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(steps) - 1)
-            since = (when - times[k])[..., None]
-            slopes = (rates[k + 1] - rates[k]) / steps[k][..., None]
-            is_known = (when >= times[0]) & (when <= times[-1])
-            at_ends.append(np.where(is_known[..., None], totals[k] + since * (rates[k] + slopes * since / 2), np.nan))
-        last = np.clip(np.searchsorted(times, ends_s, side="left"), 0, len(gaps) - 1)
-        first = np.clip(np.searchsorted(times, starts_s, side="right") - 1, 0, len(gaps) - 1)
-        return np.where((gaps[last] > gaps[first])[..., None], np.nan, at_ends[1] - at_ends[0])
-
-    def change(self, start_s: float, end_s: float) -> Array:
-        """Return by how much the rates (size,) change from one time to another."""
-        return np.array([float(np.diff(np.interp((start_s, end_s), self._times, each))[0]) for each in self._rates.T])
+        whole = totals[np.searchsorted(grid, ends_s)] - totals[np.searchsorted(grid, starts_s)]
+        # 2. Gaps in them.
+        gaps = np.append(0, np.cumsum(np.diff(self._times) > LONGEST_GAP_S))
+        first = np.clip(np.searchsorted(self._times, starts_s, side="right") - 1, 0, None)
+        last = np.clip(np.searchsorted(self._times, ends_s), 0, len(gaps) - 1)
+        is_known = (
+            (starts_s >= self._times[0]) & (ends_s <= self._times[-1] + LONGEST_GAP_S) & (gaps[last] == gaps[first])
+        )
+        return np.where(is_known[..., None], whole, np.nan)
 
     def missing_s(self, end_s: float) -> float:
         """Return the time before the end of an interval over which `integrals` holds the rates of the last sample."""
@@ -137,7 +133,8 @@ class MotionSensors:
         amounts, found = self.motion(WheelSample, start_s, end_s, states), Twist()
         if not np.isfinite(amounts).any():
             return found
-        changes, missing_s = self._wheels.change(start_s, end_s), self._wheels.missing_s(end_s)
+        changes = np.diff(self._wheels.at(np.array([start_s, end_s])), axis=0)[0]
+        missing_s = self._wheels.missing_s(end_s)
         for number, (axis, state) in enumerate(((AHEAD, DISTANCE), (YAW, TURN))):
             amount, slopes = float(amounts[number]), np.zeros(len(states))
             if math.isfinite(amount):
@@ -153,7 +150,8 @@ class MotionSensors:
         amounts, found, dt_s = self.motion(GyroSample, start_s, end_s, states), Twist(), end_s - start_s
         if not np.isfinite(amounts).all():
             return found
-        changes, late = self._gyro.change(start_s, end_s), ACCELERATION_SIGMAS[1] * self._gyro.missing_s(end_s) ** 2 / 2
+        changes = np.diff(self._gyro.at(np.array([start_s, end_s])), axis=0)[0]
+        late = ACCELERATION_SIGMAS[1] * self._gyro.missing_s(end_s) ** 2 / 2
         for axis in range(3):
             slopes = np.zeros(len(states))
             slopes[BIAS.start + axis], slopes[GYRO_OFFSET] = -dt_s, -changes[axis]

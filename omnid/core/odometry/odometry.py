@@ -1,6 +1,16 @@
 """Visual odometry of the stereo rig: predict, track, estimate, refine, accept or refuse, update the map.
 
 VisualOdometry.process is the algorithm, one frame at a time. Equations and sections are those of Dang et al. 2012.
+
+A pose by the cameras is TRACKING; DEGRADED with few inliers, few of them in the upper camera, with more than one
+hypothesis of the motion, after a gap or a refused frame, or by images that are broken. A frame without one is DEGRADED
+while wheels and gyro carry the pose, and for lost_s after the first such frame; then it is LOST. The map is started
+again when textured frames have matched nothing for restart_s, or one was recognised elsewhere.
+
+The motion since the last fix is unknown from the first frame on to which wheels and gyro carried nothing, or that was
+recognised elsewhere. It is unknown, too, where a map is started again although they say that the base has hardly
+moved: the old map would be in view, so the base was carried away, or its wheels and gyro are wrong. A map that is
+started after an unknown motion is DEGRADED at first, and the reset counter rises.
 """
 
 from __future__ import annotations
@@ -9,25 +19,25 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.corners import corners
+from omnid.core.odometry.corners import clear_around, corners
 from omnid.core.odometry.estimates import ROOM_M, OdometryEstimate, OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
 from omnid.core.odometry.image_breaks import ImageBreaks
-from omnid.core.odometry.keyframes import KeyframeLocaliser, Keyframes
-from omnid.core.odometry.line_times import LineTimes, RawImage
-from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.line_times import RawImage
+from omnid.core.odometry.local_map import Keyframe, LocalMap
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, OtherMotion
+from omnid.core.odometry.new_landmarks import located
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
-from omnid.core.odometry.tracking_state_machine import Tracking
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
 
@@ -45,6 +55,19 @@ JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 # A smaller step keeps the view: landmarks are a metre away and farther, so that they move by 6 degrees at most besides
 # the turn.
 SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
+
+
+class KeyframeLocaliser(Protocol):
+    """A bounded store of keyframes that gives the pose of a frame among them; see core/places."""
+
+    def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
+        """Keep a keyframe and its frame."""
+
+    def clear(self) -> None:
+        """Drop all keyframes."""
+
+    def locate(self, frame: StereoFrame) -> PoseEstimate | None:
+        """Return the pose of a frame among the keyframes; None if it fits none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,19 +101,25 @@ class VisualOdometry:
         raw_images: where the raw images of both cameras show the panoramas; None: they are not tested for breaks.
         """
         self._limits, self._model, self._relocaliser = limits, model, relocaliser
+        self._upper_klt = replace(klt, levels=1)  # from the lower panorama to the upper one
         self._map = LocalMap(model, klt, limits.keyframes)
-        self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser)
         self._search = PoseSearch(self._map, model, limits)
-        self._motion, self._other, self._tracking = motion or MotionFilter(), OtherMotion(), Tracking(limits)
+        self._motion, self._other = motion or MotionFilter(), OtherMotion()
         self._static_mask = StaticMask(model.cylinder)
         self._T_odom_rect = np.eye(4)
-        self._T_at_fix = self._T_odom_rect  # the last accepted pose
+        self._state, self._resets = TrackingState.LOST, 0  # resets: odom lost its relation to what was published
+        self._T_at_fix: Array | None = None  # the last accepted pose; None: there was no map yet
+        self._since_fix_s = 0.0
+        self._is_unknown = False  # nothing measured the whole motion since the last fix
+        self._refused_s: float | None = None  # since the first of consecutive refused frames; None: it was accepted
+        self._unmatched_s: float | None = None  # since the first textured one of them after lost_s
+        self._first: _Prediction | None = None  # started the map before its velocity was known
         self._step: Array | None = None  # last step by the cameras
-        self._first: StereoFrame | None = None  # started the map before its velocity was known
         self._add_keyframe: Callable[[], None] | None = None  # the keyframe that the last frame asked for
+        self._most_inliers, self._tracked_s = 0, 0.0  # since the last keyframe
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
         self._cost: tuple[float, int] | None = None  # of those in view, and their number; None: no pose was found
-        self.breaks = None if raw_images is None else ImageBreaks(model, raw_images, LineTimes(model, raw_images))
+        self.breaks = None if raw_images is None else ImageBreaks(model, raw_images)
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
@@ -127,66 +156,66 @@ class VisualOdometry:
     def _pose(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, whose images are whole: the algorithm."""
         self.complete()
-        self._step = self._cost = None
-        self._map.lost = frame.lost
+        limits, self._step, self._cost, self._map.lost = self._limits, None, None, frame.lost
 
-        # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
-        now = self._predicted(frame, dt_s)
+        # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some;
+        #    only they know a long gap.
+        T_prev_curr, is_measured = self._motion.step(frame.interval_s, dt_s, limits.max_gap_s)
+        now = _Prediction(
+            frame,
+            self._static_mask.without(frame.usable),
+            dt_s,
+            max(dt_s, SHORTEST_STEP_S) + self._since_fix_s,
+            self._T_odom_rect @ T_prev_curr,
+            math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1])),
+            is_measured,
+            self._exposure(frame, dt_s),
+        )
         if self._map.last is None:
             carried = dt_s > 0 and self._carry(now)
             return self._start_map(now, carried=carried)
 
         # 2. to 4. Track, estimate and refine: pose_search.py. Once a frame was refused, those without corners
         #    (darkness, a blank wall) are left out to save time.
-        after_refusal = self._tracking.is_refused
+        after_refusal = self._refused_s is not None
         searched = not after_refusal or self._is_textured(now)
         found = self._find(now) if searched else []
-        if self._first is not None:
-            found = self._start_again(now, found)
+        first, self._first = self._first, None
+        if first is not None and found and 0 < dt_s <= limits.max_gap_s and self._is_plausible(found[0], now):
+            found = self._start_again(first, now, found[0])
 
-        # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
+        # 5. Accept or refuse, by the inliers in both cameras and the speed that the pose implies; after a break,
+        #    relocalise, also where there are too few inliers to be relied on after an unknown motion.
         plausible = [each for each in found if self._is_plausible(each, now)]
-        is_too_fast = bool(found) and not plausible and self._has_support(found[0])
-        if searched and (after_refusal or dt_s > self._limits.max_gap_s) and self._is_doubtful(plausible):
-            recognised = self.relocalise(frame, now.exposure)
-            plausible = [recognised] if recognised is not None and self._is_plausible(recognised, now) else []
+        is_too_fast = bool(found) and not plausible and found[0].has_support(limits)
+        if searched and (after_refusal or dt_s > limits.max_gap_s):
+            relied = min(limits.good_inliers, limits.min_inlier_ratio * plausible[0].visible) if plausible else 0.0
+            if not plausible or plausible[0].inliers < relied:
+                recognised = self.relocalise(frame, now.exposure)
+                plausible = [recognised] if recognised is not None and self._is_plausible(recognised, now) else []
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = _step(now.T_odom_rect, plausible[0].T_odom_rect) if plausible and after_refusal else np.zeros(6)
         if not plausible or np.linalg.norm(gap[:3]) > JUMP_M:
             self._other.predict(dt_s)
             if is_too_fast:  # the vehicle may be as fast
                 self._other.replace(now.T_odom_rect, found[0].T_odom_rect, now.since_fix_s)
-            is_known = bool(plausible) and plausible[0].inliers >= self._limits.good_inliers
+            is_known = bool(plausible) and plausible[0].inliers >= limits.good_inliers
             return self._refuse(now, found, gap if is_known else None)
         estimate = self._other.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(now, estimate, is_reset=bool(np.linalg.norm(gap[3:]) > JUMP_RAD))
-        exposure = self._exposure(frame, dt_s)
+        exposure, inliers = self._exposure(frame, dt_s), len(estimate.landmarks)
         self._map.accept(frame.lower, estimate)
-        is_keyframe = self._keyframes.is_due(len(estimate.landmarks), dt_s)
+        self._most_inliers, self._tracked_s = max(self._most_inliers, inliers), self._tracked_s + dt_s
+        is_keyframe = inliers < max(limits.good_inliers, limits.refresh * self._most_inliers)
+        is_keyframe |= inliers < limits.refresh * limits.features and self._tracked_s >= limits.sparse_s
         if is_keyframe:
-            pose = self._T_odom_rect, self._motion.pose_covariance
-            known = None if self._limits.keyframes == 1 else estimate
-            self._add_keyframe = partial(self._keyframes.add, frame, now.usable, *pose, exposure, known)
+            covariance = self._motion.pose_covariance
+            self._add_keyframe = partial(self._make_keyframe, now, self._T_odom_rect, covariance, exposure, estimate)
         features = Features(estimate.pixels, estimate.rejected)
-        exposure = exposure if is_keyframe else self._exposure(frame)
-        result = self._result(estimate.tracked, estimate.inliers, features, exposure)
+        result = self._result(estimate.tracked, estimate.inliers, exposure, features)
         return replace(result, is_keyframe=is_keyframe)
-
-    def _predicted(self, frame: StereoFrame, dt_s: float) -> _Prediction:
-        """Return what is known of a frame before it is searched; only wheels and gyro know a long gap."""
-        T_prev_curr, is_measured = self._motion.step(frame.interval_s, dt_s, self._limits.max_gap_s)
-        return _Prediction(
-            frame,
-            self._static_mask.without(frame.usable),
-            dt_s,
-            max(dt_s, SHORTEST_STEP_S) + self._tracking.time_since_fix_s,
-            self._T_odom_rect @ T_prev_curr,
-            math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1])),
-            is_measured,
-            self._exposure(frame, dt_s),
-        )
 
     def _exposure(self, frame: StereoFrame, dt_s: float = 0.0) -> Exposure:
         """Return the exposure of a frame by the filter's velocity, after a step of dt_s was predicted to it."""
@@ -199,50 +228,29 @@ class VisualOdometry:
             self._other.agree()
         found = self._search.find(now.frame, now.usable, self._T_odom_rect, now.T_odom_rect, now.exposure)
         # After a refused frame the displacements from an unknown place lead anywhere: relocalisation decides.
-        if found is None or self._tracking.is_refused:
+        if found is None or self._refused_s is not None:
             return [] if found is None else [found]
         most_mps = REACH_SIGMAS * now.sigma_mps + float(np.linalg.norm(self._other.velocity))
         reach_m = min(most_mps, self._limits.max_speed_mps) * now.since_fix_s
         return [found, *self._search.others(now.frame, found, now.T_odom_rect, now.exposure, reach_m)]
 
-    def _start_again(self, now: _Prediction, found: list[PoseEstimate]) -> list[PoseEstimate]:
-        """Start the map again at its first frame, whose velocity this one shows; return the pose in that map."""
-        first, self._first = self._first, None
-        is_step = 0 < now.dt_s <= self._limits.max_gap_s
-        if first is None or not is_step or not found or not self._is_plausible(found[0], now):
-            return found
-        # The depths of the first frame were measured as if the rig were at rest, so that this step is wrong by a few
-        # per cent of what happens between two exposures.
-        velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found[0].T_odom_rect, now.dt_s)
+    def _start_again(self, first: _Prediction, now: _Prediction, found: PoseEstimate) -> list[PoseEstimate]:
+        """Start the map again at its first frame, whose velocity this one shows; return the pose in that map.
+
+        The depths of the first frame were measured as if the rig were at rest, so that this step is wrong by a few per
+        cent of what happens between two exposures.
+        """
+        velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found.T_odom_rect, now.dt_s)
+        then, at = (Exposure(each.frame.times, velocity, self._model) for each in (first, now))
         self._map.clear()
-        pose, exposure = (self._T_odom_rect, self._motion.pose_covariance), Exposure(first.times, velocity, self._model)
-        self._keyframes.add(first, now.usable & first.usable, *pose, exposure)
-        exposure = Exposure(now.frame.times, velocity, self._model)
-        again = self._search.estimate(now.frame, found[0].T_odom_rect, exposure, is_near=True)
+        self._make_keyframe(first, self._T_odom_rect, self._motion.pose_covariance, then)
+        again = self._search.estimate(now.frame, found.T_odom_rect, at, is_near=True)
         return [] if again is None else [again]
 
     def _is_plausible(self, estimate: PoseEstimate, now: _Prediction) -> bool:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
         most_m = self._limits.max_speed_mps * now.since_fix_s
-        return self._has_support(estimate) and estimate.distance_m(self._T_odom_rect) <= most_m
-
-    def _has_support(self, estimate: PoseEstimate) -> bool:
-        """True if the pose has enough inliers in both cameras."""
-        limits = self._limits
-        return estimate.inliers >= limits.min_inliers and estimate.least_ratio >= limits.min_inlier_ratio
-
-    def _is_well_supported(self, estimate: PoseEstimate) -> bool:
-        """True if many landmarks support a pose, or nearly all of few all around: they are no single moving thing."""
-        parts = np.unique(np.floor(estimate.pixels[:, 0] * (AROUND / self._model.cylinder.turn_px)) % AROUND)
-        is_all = estimate.least_ratio >= NEARLY_ALL and len(parts) >= AROUND / 2
-        return estimate.inliers >= self._limits.good_inliers or is_all
-
-    def _is_doubtful(self, plausible: list[PoseEstimate]) -> bool:
-        """True if no pose is plausible, or it has too few inliers to be relied on after an unknown motion."""
-        limits = self._limits
-        return not plausible or plausible[0].inliers < min(
-            limits.good_inliers, limits.min_inlier_ratio * plausible[0].visible
-        )
+        return estimate.has_support(self._limits) and estimate.distance_m(self._T_odom_rect) <= most_m
 
     def _is_textured(self, now: _Prediction) -> bool:
         """True if the frame has enough corners for a map."""
@@ -251,17 +259,17 @@ class VisualOdometry:
 
     def _accept(self, now: _Prediction, estimate: PoseEstimate, *, is_reset: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""
+        # 1. Whether many landmarks support the pose, or nearly all of few all around: they are no single moving thing.
         limits, at_previous = self._limits, None
-        is_sure = not self._other.is_open and self._is_well_supported(estimate)
-        if not self._tracking.is_refused and 0 < now.dt_s <= limits.max_gap_s:
+        is_after_gap = self._refused_s is not None or now.dt_s > self._limits.max_gap_s
+        parts = np.unique(np.floor(estimate.pixels[:, 0] * (AROUND / self._model.cylinder.turn_px)) % AROUND)
+        is_all = estimate.least_ratio >= NEARLY_ALL and len(parts) >= AROUND / 2
+        is_sure = not self._other.is_open and (estimate.inliers >= limits.good_inliers or is_all)
+        # 2. The filter, and the times of the rows.
+        if not is_after_gap and now.dt_s > 0:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            at_previous = self._motion.accept(
-                T_prev_curr,
-                estimate.covariance,
-                now.dt_s,
-                interval_s=now.frame.interval_s,
-                is_sure=is_sure,
-            )
+            interval_s = now.frame.interval_s if is_sure else None
+            at_previous = self._motion.accept(T_prev_curr, estimate.covariance, now.dt_s, interval_s)
             self._step = T_prev_curr if is_sure else None
             if is_sure and self.breaks is not None:
                 velocity = se3.log(T_prev_curr) / now.dt_s
@@ -270,15 +278,29 @@ class VisualOdometry:
             self._motion.reset()
         self._map.settle(at_previous)
         self._motion.found(estimate.covariance + self._map.covariance_of(estimate))
-        self._T_odom_rect = self._T_at_fix = estimate.T_odom_rect
+        # 3. The pose and its state.
+        self._T_odom_rect = estimate.T_odom_rect
         # What the upper camera does not show where it must be is an outlier there.
         self._cost = estimate.cost + OUTLIER_COST * (1.0 - estimate.upper_ratio), estimate.in_view
         if len(estimate.landmarks):
             away = self._map.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
             self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
-        is_doubtful = not is_sure or estimate.upper_ratio < limits.good_inlier_ratio
-        self._tracking.accept(now.dt_s, is_doubtful=is_doubtful, is_reset=is_reset)
+        is_doubtful = not is_sure or estimate.upper_ratio < limits.good_inlier_ratio or is_after_gap
+        self._fix(is_doubtful=is_doubtful, is_reset=is_reset)
         self._static_mask.observe(now.frame.lower.panorama, self._T_odom_rect)
+
+    def _fix(self, *, is_doubtful: bool, is_reset: bool) -> None:
+        """Set the state of a pose that was accepted, or at which a map was started."""
+        self._state = TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING
+        self._resets += is_reset
+        self._T_at_fix, self._since_fix_s, self._is_unknown = self._T_odom_rect, 0.0, False
+        self._refused_s = self._unmatched_s = None
+
+    def _miss(self, dt_s: float, *, is_lost: bool, carried: bool) -> None:
+        """Set the state of a frame without a pose; carried: wheels and gyro carry the pose."""
+        self._state = TrackingState.LOST if is_lost and not carried else TrackingState.DEGRADED
+        self._since_fix_s += dt_s
+        self._is_unknown |= self._T_at_fix is not None and not carried
 
     def _refuse(self, now: _Prediction, found: list[PoseEstimate], gap: Array | None) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
@@ -286,31 +308,33 @@ class VisualOdometry:
         found: poses that were not accepted. gap (6,): step from the predicted pose to the one that was recognised
         elsewhere; None: it was not.
         """
-        # 1. Whether the predicted pose would have the old map in view, and most of the tracks, few as they may be, show
-        #    it there.
-        supports = bool(found) and found[0].inlier_ratio > 0.5 and _keeps_view(now.T_odom_rect, found[0].T_odom_rect)
-        stayed = _keeps_view(self._T_at_fix, now.T_odom_rect) and not supports
-        # 2. Go on to the predicted pose.
+        # 1. Go on to the predicted pose. Of a gap without frames no more than max_gap_s counts, because nothing could
+        #    be seen in it.
+        limits, step_s, was_unknown = self._limits, min(now.dt_s, self._limits.max_gap_s), self._is_unknown
         carried = self._carry(now) and gap is None
-        was_unknown = self._tracking.unknown_motion
-        restarts = self._tracking.refuse(
-            now.dt_s,
-            is_textured=self._is_textured(now),
-            is_elsewhere=gap is not None,
-            carried=carried,
-            stayed=stayed,
-        )
-        if carried and self._tracking.unknown_motion and not was_unknown:
+        self._refused_s = 0.0 if self._refused_s is None else self._refused_s + step_s
+        is_lost = self._refused_s >= limits.lost_s
+        if is_lost and self._is_textured(now):
+            self._unmatched_s = 0.0 if self._unmatched_s is None else self._unmatched_s + step_s
+        is_unmatched = self._unmatched_s is not None and self._unmatched_s >= limits.restart_s
+        restarts = is_lost and (gap is not None or is_unmatched)
+        self._miss(now.dt_s, is_lost=is_lost, carried=carried)
+        # 2. Whether the predicted pose would have the old map in view, and most of the tracks, few as they may be, do
+        #    not show it there.
+        if restarts and self._T_at_fix is not None and _keeps_view(self._T_at_fix, now.T_odom_rect):
+            is_shown = bool(found) and found[0].inlier_ratio > 0.5
+            self._is_unknown |= not (is_shown and _keeps_view(now.T_odom_rect, found[0].T_odom_rect))
+        if carried and self._is_unknown and not was_unknown:
             # What carried the pose is contradicted now, and has measured nothing since the last fix.
-            self._motion.distrust((UNKNOWN_SPEED_SIGMA * self._tracking.time_since_fix_s) ** 2 * np.eye(6))
+            self._motion.distrust((UNKNOWN_SPEED_SIGMA * self._since_fix_s) ** 2 * np.eye(6))
         if not restarts:
-            return self._result(0, 0, exposure=self._exposure(now.frame))
+            return self._result(0, 0, self._exposure(now.frame))
         # 3. Start the map again.
         self._map.clear()
         self._relocaliser.clear()
         if gap is not None:
             self._motion.distrust(np.outer(gap, gap))
-        if self._tracking.unknown_motion:
+        if self._is_unknown:
             self._motion.reset()
         return self._start_map(replace(now, dt_s=0.0), carried=carried, is_elsewhere=gap is not None)
 
@@ -322,21 +346,45 @@ class VisualOdometry:
         )
 
     def _start_map(self, now: _Prediction, *, carried: bool, is_elsewhere: bool = False) -> OdometryEstimate:
-        """Start a map at the current pose if the frame has enough landmarks; the facts: see Tracking."""
+        """Start a map at the current pose if the frame has enough landmarks."""
         exposure = self._exposure(now.frame)
-        self._keyframes.add(now.frame, now.usable, self._T_odom_rect, self._motion.pose_covariance, exposure)
+        self._make_keyframe(now, self._T_odom_rect, self._motion.pose_covariance, exposure)
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
-            self._tracking.miss(now.dt_s, carried=carried)
-            return self._result(0, 0, exposure=exposure)
-        self._first = None if now.frame.times.is_at_once else now.frame
+            self._refused_s = self._unmatched_s = None
+            self._miss(now.dt_s, is_lost=True, carried=carried)
+            return self._result(0, 0, exposure)
+        self._first = None if now.frame.times.is_at_once else now
         self._motion.found(self._motion.pose_covariance)
-        self._tracking.start(carried=carried, is_elsewhere=is_elsewhere)
-        self._T_at_fix = self._T_odom_rect
-        return replace(self._result(len(self._map), len(self._map), exposure=exposure), is_keyframe=True)
+        # A map that replaces a lost one says nothing about the motion between the two.
+        is_unknown = self._is_unknown or (self._T_at_fix is not None and not carried)
+        self._fix(is_doubtful=is_unknown and not is_elsewhere, is_reset=is_unknown)
+        return replace(self._result(len(self._map), len(self._map), exposure), is_keyframe=True)
+
+    def _make_keyframe(
+        self,
+        now: _Prediction,
+        T_odom_rect: Array,
+        covariance: Array,
+        exposure: Exposure,
+        seen: PoseEstimate | None = None,
+    ) -> None:
+        """Add a frame to the map, with its pose (4, 4) and covariance (6, 6), and with new landmarks.
+
+        seen: the estimate whose landmarks stay; None: all are new.
+        """
+        pixels, views = (np.zeros((0, 2)), np.zeros((0, 3))) if seen is None else (seen.pixels, seen.views)
+        points = corners(now.frame.lower, clear_around(now.usable, pixels), self._limits.features - len(pixels))
+        frame = replace(now.frame, exposure=exposure)
+        new = located(frame, points, self._model, self._upper_klt, exposure, views)
+        keyframe = Keyframe(frame.seq, frame.lower, T_odom_rect, covariance)
+        self._map.add_keyframe(keyframe, new)
+        if len(self._map) >= self._limits.min_inliers:
+            self._relocaliser.add(frame, keyframe)
+        self._most_inliers, self._tracked_s = 0, 0.0
 
     def _result(
-        self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
+        self, tracked: int, inliers: int, exposure: Exposure, features: Features | None = None
     ) -> OdometryEstimate:
         others_mps = np.pad(self._T_odom_rect[:3, :3].T @ self._other.velocity, (0, 3))
         return OdometryEstimate(
@@ -344,8 +392,8 @@ class VisualOdometry:
             self._motion.pose_covariance + self._other.covariance(self._T_odom_rect),
             self._motion.velocity,
             self._motion.velocity_covariance + np.outer(others_mps, others_mps),
-            self._tracking.state,
-            self._tracking.resets,
+            self._state,
+            self._resets,
             tracked,
             inliers,
             features or Features(),

@@ -29,7 +29,7 @@ NOISE_CORRELATION = 3.0
 GRADIENT_NOISE = 0.12
 FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
-LANES, CELL_LANES = 8, 32  # columns that the compiler computes at once, in templates and windows, and in cells
+LANES = 8  # columns that the compiler computes at once
 MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture.
 
 
@@ -56,15 +56,10 @@ def sample(
     from the centres in the current panorama.
     """
     side, half = templates.shape[1], templates.shape[1] // 2
-    width = -(-side // LANES) * LANES
-    stride = -(-(4 * side + 8) // CELL_LANES) * CELL_LANES  # what a template reaches, and the cubic kernel
+    stride = 4 * side + 8  # what a template reaches, and the cubic kernel
     cell = np.empty((stride, stride), np.float32)
-    greys, at = cell.reshape(-1), np.empty(width, np.int32)
-    across, down, part = (
-        np.empty(4 * width, np.float32),
-        np.empty(4 * width, np.float32),
-        np.empty(4 * width, np.float32),
-    )
+    greys, at, weights = cell.reshape(-1), np.empty(side, np.int32), np.empty((3, 4 * side), np.float32)
+    across, down, part = weights[0], weights[1], weights[2]
     columns, rows = np.empty((3, 3)), np.empty((3, 3))
     for n in chosen:
         # A place that is NaN or absurd has no template.
@@ -88,7 +83,7 @@ def sample(
             y0 = np.float32(centres[n, 1] - top + rows[0, 0] + t * (rows[1, 0] + t * rows[2, 0]))
             y1 = np.float32(rows[0, 1] + t * (rows[1, 1] + t * rows[2, 1]))
             y2 = np.float32(rows[0, 2] + t * (rows[1, 2] + t * rows[2, 2]))
-            for j in range(width):
+            for j in range(side):
                 s = np.float32(np.int32(j) - np.int32(half))
                 x, y = x0 + s * (x1 + s * x2), y0 + s * (y1 + s * y2)
                 column, row = np.int32(x), np.int32(y)
@@ -222,21 +217,19 @@ def fit(
     less than reach_px.
     """
     side, size = templates.shape[1] - 2, 5 if slope_sigma > 0 else 3
-    width = -(-side // LANES) * LANES  # columns of a window in memory
     pixels, noise = side * side, 2 * max(noise_grey, 1.0) ** 2
-    design, inside = np.zeros((size, side, width), np.float32), np.zeros((side, width), np.float32)
+    width = -(-side // LANES) * LANES  # of windows in memory; columns beyond the side are zero
+    design, ones = np.zeros((size, side, width), np.float32), np.ones((side, width), np.float32)
     window, room = np.zeros((side, width), np.float32), np.empty(width, np.float32)
-    stride = -(-(width + 2 * reach_px + 1) // CELL_LANES) * CELL_LANES
-    cell = np.zeros((side + 2 * reach_px + 1, stride), np.float32)
+    cell = np.empty((side + 2 * reach_px + 1, side + 2 * reach_px + 1), np.float32)
     normal, inverse, sums = np.empty((size, size)), np.empty((size, size)), np.empty(size)
     right, weighted, solution = np.empty(size), np.empty(size), np.empty(size)
-    inside[:, :side] = 1.0
     for n in range(len(templates)):
         fits[n], shift[n], covariance[n] = False, 0.0, 0.0
         # 1. Templates with texture: sums and products of the design, about its means.
         write_design(templates[n], design)
         for a in range(size):
-            sums[a] = dot(design[a], inside, room)
+            sums[a] = dot(design[a], ones, room)
             for b in range(a + 1):
                 normal[a, b] = normal[b, a] = dot(design[a], design[b], room) - sums[a] * sums[b] / pixels
         trace, determinant = normal[0, 0] + normal[1, 1], normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
@@ -248,8 +241,8 @@ def fit(
         x, y, gain, variance, residual = 0.0, 0.0, 1.0, noise, 0.0
         for _ in range(ITERATIONS):
             # 2. The window at the shift, and its products with the design and with itself.
-            write_window(cell, x + reach_px, y + reach_px, inside, window)
-            total = dot(window, inside, room)
+            write_window(cell, x + reach_px, y + reach_px, window)
+            total = dot(window, ones, room)
             residual = dot(window, window, room) - total * total / pixels
             # 3. The step, with the prior of the slopes.
             for a in range(size):
@@ -309,31 +302,28 @@ def write_design(template: Floats, design: Floats) -> None:
 
 @inner
 def copy_cell(image: Image, left: int, top: int, width: int, height: int, cell: Floats) -> None:
-    """Write pixels of an image, less the middle grey, into a cell (S, W); the border is repeated.
-
-    W is a multiple of CELL_LANES; columns beyond the width are not defined."""
+    """Write pixels of an image, less the middle grey, into a cell (S, W); the border is repeated."""
     for i in range(height):
         line, to = image[within(top + i, image.shape[0])], cell[i]
-        if left >= 0 and left + -(-width // CELL_LANES) * CELL_LANES <= image.shape[1]:
-            for start in range(0, width, CELL_LANES):
-                source, place = line[left + start :], to[start:]
-                for j in range(CELL_LANES):
-                    place[j] = np.float32(source[j]) - MIDDLE_GREY
+        if left >= 0 and left + width <= image.shape[1]:
+            source = line[left:]
+            for j in range(width):
+                to[j] = np.float32(source[j]) - MIDDLE_GREY
         else:
             for j in range(width):
                 to[j] = np.float32(line[within(left + j, image.shape[1])]) - MIDDLE_GREY
 
 
 @inner
-def write_window(cell: Floats, x: float, y: float, inside: Floats, window: Floats) -> None:
+def write_window(cell: Floats, x: float, y: float, window: Floats) -> None:
     """Write the window (S, W) that begins between the pixels of a cell, by bilinear interpolation."""
     left, top = math.floor(x), math.floor(y)
     u, v = np.float32(x - left), np.float32(y - top)
     p, q = np.float32(1) - u, np.float32(1) - v
     for i in range(window.shape[0]):
-        above, below, to, ones = cell[top + i, left:], cell[top + i + 1, left:], window[i], inside[i]
-        for j in range(window.shape[1]):
-            to[j] = ones[j] * (q * (p * above[j] + u * above[j + 1]) + v * (p * below[j] + u * below[j + 1]))
+        above, below, to = cell[top + i, left:], cell[top + i + 1, left:], window[i]
+        for j in range(window.shape[0]):
+            to[j] = q * (p * above[j] + u * above[j + 1]) + v * (p * below[j] + u * below[j + 1])
 
 
 @inner

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry import patch_kernels
+from omnid.core.odometry.tracking import padded
 from omnid.core.stereo.triangulation import triangulate
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
@@ -29,10 +30,8 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 WINDOW_PX = 13  # side of a patch
-# Half the side of the window in which the slope of the dense disparity is taken.
-SLOPE_REACH_PX = 8
-# Disparities that differ by more belong to another surface.
-SAME_SURFACE_PX = 2.0
+SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the dense disparity is taken
+SAME_SURFACE_PX = 2.0  # disparities that differ by more belong to another surface
 # Weight [px^2] of slope zero (an upright surface facing the camera) in the least squares: a full window has 6936, so
 # that its slope is 0.7 % too flat.
 SLOPE_PRIOR = 50.0
@@ -42,10 +41,8 @@ SLOPE_WINDOW_PX, SLOPE_ROUNDS = 21, 2
 MAX_SLOPE = 0.7  # Largest slope of a disparity: steeper planes are seen too obliquely for a patch.
 # Standard deviation [px/px] of the slopes by dense stereo, which are a third too flat, because its windows are upright.
 SLOPE_SIGMA = 0.1
-# Largest distance of an aligned patch from its prediction, if pose and depth are known well.
-REACH_PX = 1
-# Largest lateral distance of an aligned patch in the upper panorama from its tracked pixel.
-CROSS_PX = 0.5
+REACH_PX = 1  # largest distance of an aligned patch from its prediction, if pose and depth are known well
+CROSS_PX = 0.5  # largest lateral distance of an aligned patch in the upper panorama from its tracked pixel
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +80,7 @@ def plane_templates(
     if not len(pixels):
         return templates
     # All panoramas of a run have the same columns.
-    focal_px, centres = model.cylinder.focal_px, _padded(images[int(anchors[0])], pixels)
+    focal_px, centres = model.cylinder.focal_px, padded(images[int(anchors[0])], pixels)
     points, normals = np.ascontiguousarray(surfaces[0]), _normals(surfaces, model.baseline_m)
     shift = np.ascontiguousarray(np.rint(predicted) - predicted)
     height_m = model.baseline_m if upper else 0.0
@@ -107,18 +104,14 @@ def _normals(surfaces: tuple[Array, Array], baseline_m: float) -> Array:
     return np.column_stack([ahead * x - sideways * y, ahead * y + sideways * x, up])
 
 
-def _turned(R: Array, vectors: Array) -> Array:
-    """Return vectors (N, 3) turned by rotations (N, 3, 3)."""
-    return np.asarray((R @ vectors[:, :, None])[:, :, 0])
-
-
 def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: StereoModel) -> Array:
     """Return the slopes (N, 2) of the disparity in the frames to which T_curr_ref (N, 4, 4) leads.
 
     surfaces: points (N, 3) and slopes (N, 2). Zero where the plane is seen nearly edge on.
     """
     R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3]
-    n, seen = _turned(R, _normals(surfaces, model.baseline_m)), _turned(R, surfaces[0]) + t
+    n = (R @ _normals(surfaces, model.baseline_m)[:, :, None])[:, :, 0]
+    seen = (R @ surfaces[0][:, :, None])[:, :, 0] + t
     # The plane n' . p' = 1 + n' . t has the normal n' / (1 + n' . t).
     n /= 1 + (n * t).sum(axis=1, keepdims=True)
     along = (seen[:, 0] * n[:, 1] - seen[:, 1] * n[:, 0]) / np.hypot(seen[:, 0], seen[:, 1])
@@ -160,9 +153,9 @@ def fitted_slopes(
     for _ in range(SLOPE_ROUNDS):
         templates = _in_upper(pair, pixels[known], predicted, found, model, SLOPE_WINDOW_PX)
         change = start[known] - found
-        fitted = _fit(templates, pair[1], np.rint(predicted), REACH_PX, change, SLOPE_SIGMA)
+        fitted = align(templates, pair[1], predicted, REACH_PX, change, SLOPE_SIGMA)
         fits &= fitted.found
-        found, predicted = found + change, predicted + fitted.pixels
+        found, predicted = found + change, fitted.pixels
     fits &= (np.abs(found) < MAX_SLOPE).all(axis=1)
     slopes[known[fits]] = found[fits]
     return slopes
@@ -184,32 +177,25 @@ def _in_upper(
     )
 
 
-def align(templates: Floats, current: PaddedPanorama, predicted: Array, reach_px: int = REACH_PX) -> AlignedPatches:
-    """Align templates (N, T, T), centred on predicted (N, 2), with the current panorama.
-
-    reach_px: a patch that has to move this far was predicted wrongly.
-    """
-    found = _fit(templates, current, np.rint(predicted), reach_px, np.zeros((len(templates), 2)), 0.0)
-    return AlignedPatches(predicted + found.pixels, found.covariance, found.found)
-
-
-def _fit(
+def align(
     templates: Floats,
     current: PaddedPanorama,
-    at: Array,
-    reach_px: int,
-    slopes: Array,
-    slope_sigma: float,
+    predicted: Array,
+    reach_px: int = REACH_PX,
+    slopes: Array | None = None,
+    slope_sigma: float = 0.0,
 ) -> AlignedPatches:
-    """Fit templates (N, T, T) to the windows of a panorama at pixels (N, 2); the pixels returned are shifts.
+    """Align templates (N, T, T), centred on predicted (N, 2), with the current panorama.
 
-    slopes (N, 2): prior of their change, which is written; slope_sigma: its standard deviation, 0: they do not change.
+    reach_px: a patch that has to move this far was predicted wrongly. slopes (N, 2): prior of their change, which is
+    written; slope_sigma: its standard deviation, 0: they do not change.
     """
-    count, centres = len(templates), _padded(current, at)
-    found = AlignedPatches(np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool))
-    noise_grey, results = current.noise_grey, (found.pixels, slopes, found.covariance, found.found)
+    count, centres = len(templates), padded(current, np.rint(predicted))
+    slopes = np.zeros((count, 2)) if slopes is None else slopes
+    shift, covariance, found = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool)
+    noise_grey, results = current.noise_grey, (shift, slopes, covariance, found)
     patch_kernels.fit(templates, current.image, centres, noise_grey, reach_px, slope_sigma, *results)
-    return found
+    return AlignedPatches(predicted + shift, covariance, found)
 
 
 def align_rows(
@@ -246,8 +232,3 @@ def view_noise(covariance: Array, row_variance: Array) -> Array:
     noise = np.broadcast_to(covariance, (len(row_variance), 2, 2))[:, [0, 1, 1]][:, :, [0, 1, 1]]
     noise[:, 2, 2] += row_variance
     return noise
-
-
-def _padded(panorama: PaddedPanorama, pixels: Array) -> Array:
-    """Return pixels (N, 2) of the padded image."""
-    return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])

@@ -5,7 +5,6 @@ Equations and sections are those of Dang et al. 2012.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,15 +13,15 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import REACH_PX
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
-from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.motion_hypotheses import LANDMARKS, displacements
 from omnid.core.odometry.plane_patches import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import (
     CORRELATED,
-    KERNEL_WIDTH,
     OUTLIER_SQUARED,
     GaussNewtonResult,
+    cost,
     gauss_newton,
     ransac,
 )
@@ -45,7 +44,7 @@ RECOGNISED_ROUNDS = 2
 # Standard deviation of a track whose patch was not yet warped to the new viewpoint.
 COARSE_SIGMA_PX = 0.3
 # Cost of a landmark that is no inlier: that of the last one.
-OUTLIER_COST = KERNEL_WIDTH**2 / 2 * math.log1p(OUTLIER_SQUARED / KERNEL_WIDTH**2) / CORRELATED
+OUTLIER_COST = float(cost(OUTLIER_SQUARED))
 # Share of the predicted landmarks, tracked, below which another guess is tried; the same of inliers near a guess, as
 # without a pyramid tracks stay, in noise, near a wrong prediction and confirm it.
 GOOD_RATIO = 0.5
@@ -120,32 +119,16 @@ class PoseSearch:
         return [each for each in others if each is not None and each.distance_m(T_predicted) < max(reach_m, off_m)]
 
     def estimate(self, frame: StereoFrame, T_guess: Array, exposure: Exposure, *, is_near: bool) -> PoseEstimate | None:
-        """Return the pose from one guess; None: no landmarks were found."""
+        """Return the pose from one guess (4, 4); None where fewer than MIN_LANDMARKS support it."""
         # 1. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
         tracks = self._map.track(frame.lower, T_guess, self._tracked, turn=frame.seq, near=is_near)
-
-        # 2. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton on
-        #    the bearings in both panoramas (IV.C, in place of eq. 9).
-        coarse = self.coarse(frame, tracks, T_guess, exposure)
-        if coarse is None:
-            return None
-
-        # 3. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
-        return self.refine(frame, coarse, exposure)
-
-    def coarse(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure) -> CoarsePose | None:
-        """Return the pose that most tracks support, None where fewer than MIN_LANDMARKS do.
-
-        RANSAC on three points (Dang et al. 2012, section IV.B), then Gauss-Newton on the bearings in both cameras, in
-        place of the paper's eq. (9).
-        """
         if len(tracks.landmarks) < MIN_LANDMARKS:
             return None
-        T_guess_odom = se3.inverse(T_odom_guess)
+        T_guess_odom = se3.inverse(T_guess)
         in_guess = se3.apply(T_guess_odom, self._map.table.points[tracks.landmarks])
-        slopes = self._map.slopes(T_odom_guess, tracks.landmarks)
+        slopes = self._map.slopes(T_guess, tracks.landmarks)
         shift = exposure.shift(in_guess)
-        # 1. The rows in the upper panorama, where the patches must fit within REACH_PX of where the depths put them; a
+        # 2. The rows in the upper panorama, where the patches must fit within REACH_PX of where the depths put them; a
         #    wrong one is an outlier of the pose.
         guess = tracks.pixels + shift.lower - shift.upper
         guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
@@ -154,18 +137,20 @@ class PoseSearch:
         rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, REACH_PX, spread_px)
         disparity = rows - tracks.pixels[:, 1]
         views = np.column_stack([tracks.pixels, rows]) + np.column_stack([shift.lower, shift.upper[:, 1]])
-        # 2. RANSAC and Gauss-Newton.
+        # 3. RANSAC on three points (IV.B) and Gauss-Newton on the bearings in both cameras (IV.C, in place of eq. 9).
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
         chosen, noise = np.flatnonzero(is_inlier), shift.noise(exposure.motion)
         landmarks, views, noise = tracks.landmarks[chosen], views[chosen], noise[chosen]
         solution, kept = self._solve(landmarks, views, T_curr_guess @ T_guess_odom, self._coarse_model, noise)
         if solution is None:
             return None
+        # 4. Align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
         chosen = chosen[kept]
-        return CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
+        coarse = CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
+        return self.refine(frame, coarse, exposure)
 
     def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure) -> PoseEstimate | None:
-        """Return the pose from the keyframes' patches of all landmarks in view, None where too few are aligned.
+        """Return the pose from the keyframes' patches of all landmarks in view; None where too few are aligned.
 
         The disparity of the tracked landmarks was measured between the images of this frame, so it is kept and goes
         along with the aligned lower row. Tracks from the last panorama and patches of the keyframes are two independent
@@ -201,8 +186,7 @@ class PoseSearch:
         # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
         # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
         # and the scale would drift.
-        of_depth = by_motion[:, 2] - by_motion[:, 1]
-        assumed = AssumedMotion(exposure.motion, of_depth[kept])
+        of_depth = (by_motion[:, 2] - by_motion[:, 1])[kept]
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
         is_kept = np.zeros(len(self._map), bool)
         is_kept[landmarks] = True
@@ -221,7 +205,8 @@ class PoseSearch:
             pixels,
             variance[kept],
             rejected,
-            assumed,
+            of_depth,
+            exposure.motion,
             _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
             in_view,
             upper_ratio=_upper_ratio(frame, coarse),
@@ -298,6 +283,4 @@ def _cost(squared: Array, in_view: int) -> float:
     It is the negative logarithm of the likelihood with the Cauchy kernel, k^2 / 2 log(1 + e^2 / k^2), by the landmarks
     that count as one; an outlier costs what the last inlier does.
     """
-    width2 = KERNEL_WIDTH**2
-    inliers = width2 / 2 * float(np.log1p(squared / width2).sum()) / CORRELATED
-    return (inliers + (in_view - len(squared)) * OUTLIER_COST) / max(1, in_view)
+    return (float(cost(squared).sum()) + (in_view - len(squared)) * OUTLIER_COST) / max(1, in_view)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
+from omnid.core.odometry.estimates import ROOM_M
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -20,7 +21,6 @@ Flags = NDArray[np.bool_]
 # Columns are compared only if the world should have moved by this angle, and by these pixels at half resolution: in a
 # small panorama the angle is one pixel, by which most of a view hardly changes.
 MIN_FLOW_RAD, MIN_FLOW_PX = 0.04, 2.0
-USUAL_RANGE_M = 3.0  # range at which a translation is converted to an angle.
 # Grey levels: largest difference that counts as unchanged. Measured: with 0.67 and 1.5 times as much the odometry errs
 # by 1.00 to 1.06 times as much.
 SAME_LEVEL = 6
@@ -47,7 +47,7 @@ class StaticMask:
             columns: Array = 2.0 * np.arange(before.shape[1], dtype=float) + 0.5
             azimuth = self._cylinder.azimuth(columns)
             across = np.abs(twist[1] * np.cos(azimuth) - twist[0] * np.sin(azimuth))
-            flow_rad = abs(twist[5]) + across / USUAL_RANGE_M
+            flow_rad = abs(twist[5]) + across / ROOM_M
             moving = flow_rad > max(MIN_FLOW_RAD, 2 * MIN_FLOW_PX / self._cylinder.focal_px)
             if np.mean(moving) <= 0.5:
                 return

@@ -1,6 +1,7 @@
 """Kanade-Lucas-Tomasi tracking on panoramas, of which a full turn wraps around, with the forward-backward check.
 
-Below it: turns between two panoramas, by circular correlation and by the paper's steps (Dang et al. 2012, IV.F).
+Below it: normalised correlation of windows, and turns between two panoramas, by circular correlation and by the paper's
+steps (Dang et al. 2012, IV.F).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from omnid.core.odometry.patch_kernels import CONVERGED_PX
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
@@ -55,7 +57,7 @@ def flow(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt:
 
     Returns the pixels (N, 2) in b and flags (N,) of those that ended inside the image.
     """
-    start, target = _padded(points, a), _padded(guess, b)
+    start, target = (np.ascontiguousarray(padded(*at)[:, None], np.float32) for at in ((a, points), (b, guess)))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, CONVERGED_PX)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         a.image,
@@ -73,10 +75,9 @@ def flow(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt:
     return moved, (status.ravel() > 0) & inside & shown & np.isfinite(moved).all(axis=1)
 
 
-def _padded(points: Array, panorama: PaddedPanorama) -> NDArray[np.float32]:
-    """Return points (N, 1, 2) float32 in the padded image."""
-    columns = panorama.padded(points[:, 0])
-    return np.ascontiguousarray(np.stack([columns, points[:, 1]], axis=1)[:, None, :], np.float32)
+def padded(panorama: PaddedPanorama, pixels: Array) -> Array:
+    """Return pixels (N, 2) of the padded image."""
+    return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])
 
 
 def steps() -> list[float]:
@@ -86,6 +87,27 @@ def steps() -> list[float]:
     """
     both = [sign * k * STEP_RAD for k in range(1, 10) for sign in (1, -1)]
     return [0.0, *both, 10 * STEP_RAD]
+
+
+def normalised_patches(
+    panorama: PaddedPanorama, pixels: Array, side: int, step_px: int = 1, image: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """Return patches (N, side^2) of zero mean and unit length about pixels (N, 2), and their standard deviations (N,).
+
+    Greys between pixels are interpolated; beyond the image its border is repeated. step_px: between two samples. image:
+    a padded one that is sampled in place of the panorama's. The product of two patches is their correlation.
+    """
+    source = panorama.image if image is None else image
+    offsets = ((np.arange(side) - side // 2) * step_px).astype(np.float32)
+    columns = panorama.padded(pixels[:, :1]).astype(np.float32) + np.tile(offsets, side)
+    rows = pixels[:, 1:].astype(np.float32) + np.repeat(offsets, side)
+    patches = np.zeros(columns.shape, np.float32)
+    if len(pixels):  # OpenCV refuses empty maps
+        patches[:] = cv2.remap(source, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    patches -= patches.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(patches, axis=1)
+    # A patch without contrast divides by no zero.
+    return np.asarray(patches / np.maximum(length, 1e-9)[:, None]), np.asarray(length / side)
 
 
 def correlation_peaks(before: Image, after: Image, usable: Flags, turn_px: int = 0) -> list[float]:

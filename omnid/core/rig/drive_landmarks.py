@@ -17,7 +17,8 @@ from calib.fit.rig_from_drive import DriveObservations
 from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
-from omnid.core.odometry.local_map import Keyframe, LocalMap
+from omnid.core.odometry.exposure_times import NO_VELOCITY
+from omnid.core.odometry.local_map import Keyframe, LocalMap, NewLandmarks
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.types.panorama import Panoramas
@@ -108,14 +109,16 @@ class DriveLandmarks:
         slopes = disparity_slopes(disparity, pixels, above[:, 1] - pixels[:, 1])
         slopes = fitted_slopes(pair, pixels, above, slopes, self._model)
         keyframe = Keyframe(self._number, current.lower, T_odom_rect, np.zeros((6, 6)))
-        ids = self._map.add_keyframe(keyframe, np.column_stack([pixels, above[:, 1]]), slopes)
-        rows, known = self._map.rows(ids)
+        views, noise = np.column_stack([pixels, above[:, 1]]), np.zeros((len(pixels), 3, 3))
+        located = NewLandmarks(pixels, views, slopes, noise, np.zeros((1, 3, 0)), NO_VELOCITY)
+        known = self._map.add_keyframe(keyframe, located)
+        rows = np.flatnonzero(self._map.table.anchor == self._number)
         self._points = np.concatenate([self._points, self._map.table.points[rows]])
         # 4. Keep those whose patch fits in the upper panorama as well.
         in_upper, fits = self._aligned(current, T_odom_rect, rows, above[known], upper=True)
         self._observe(rows[fits], 0, pixels[known][fits])
         self._observe(rows[fits], 1, in_upper[fits])
-        self._map.keep(np.delete(self._map.table.id, rows[~fits]))
+        self._map.remove(rows[~fits])
 
     def _observe(self, rows: Indices, camera: int, pixels: Array) -> None:
         """Note where the newest keyframe's lower (camera 0) or upper panorama shows landmarks (rows of the map)."""

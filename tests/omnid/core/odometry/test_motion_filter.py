@@ -86,7 +86,7 @@ def observe(motion: MotionFilter, end_s: float, rng: np.random.Generator) -> Non
     T = T_RECT_BASE @ step(end_s - PAIR_S, end_s) @ se3.inverse(T_RECT_BASE)
     T = T @ se3.exp(rng.multivariate_normal(np.zeros(6), CAMERA_COVARIANCE))
     sensed(motion, end_s)
-    motion.accept(T, CAMERA_COVARIANCE, PAIR_S, interval_s=interval(motion, end_s), is_sure=True)
+    motion.accept(T, CAMERA_COVARIANCE, PAIR_S, interval(motion, end_s))
     motion.found(CAMERA_COVARIANCE)
 
 
