@@ -62,7 +62,3 @@ if not TYPE_CHECKING:  # a type checker would take any name for one of this pack
             raise AttributeError(f"module 'omnid' has no attribute {name!r}")
         value = globals()[name] = getattr(import_module(_MODULES[name]), name)
         return value
-
-    def __dir__() -> list[str]:
-        """The names of the public API."""
-        return sorted({*globals(), *__all__})

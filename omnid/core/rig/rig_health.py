@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import islice
 from typing import Final
 
 import cv2
@@ -62,7 +61,7 @@ MIN_MATCHES: Final = 120
 DRIFTED_DEG, BROKEN_DEG = 0.2, 2.0
 # Weight of the shift's angle against the rotation's, because a shifted viewpoint affects near points only.
 SHIFT_WEIGHT: Final = 0.2
-# Standard deviations subtracted from rotation and shift, so that an uncertain finding accuses no rig.
+# Standard deviations subtracted from rotation and shift: an uncertain finding accuses no rig.
 SIGMAS: Final = 4.0
 # Least part of the points with contrast that match: with a rig that is wrong by many degrees they match by chance only.
 # Corners without contrast are noise, which matches with no rig.
@@ -120,7 +119,6 @@ class RigFinding:
     matches: int
     tried: int  # points that were searched
     drift: RigDrift | None  # of the upper camera; None: there are fewer than MIN_MATCHES
-    misfit_deg: float  # rotation, or part of the shift, less SIGMAS standard deviations; 0 where it is unknown
     left_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
 
     @property
@@ -191,7 +189,8 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
     lower, upper = np.concatenate([one.lower for one in found]), np.concatenate([one.upper for one in found])
     drift, misfit_deg, left_px = None, 0.0, math.nan
     if len(lower) >= MIN_MATCHES:
-        # 1. The rotation and shift of the upper camera that explain the columns.
+        # 1. The rotation and shift of the upper camera that explain the columns; the rotation, or a part of the shift,
+        #    less SIGMAS standard deviations counts.
         drift = estimate_rig_drift(cylinder.rays(lower), cylinder.rays(upper))
         angles = (drift.turn, drift.turn_sigma), (drift.shift, drift.shift_sigma)
         turn, shift = (float(np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma)) for angle, sigma in angles)
@@ -210,7 +209,7 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
         state = RigState.UNCHECKED
     elif misfit_deg > DRIFTED_DEG or left_px > DRIFTED_PX:
         state = RigState.DRIFTED
-    return RigFinding(state, len(lower), sum(one.tried for one in found), drift, misfit_deg, left_px)
+    return RigFinding(state, len(lower), sum(one.tried for one in found), drift, left_px)
 
 
 class RigHealth:
@@ -306,8 +305,8 @@ class RigHealth:
         # 2. The newest views alone may show a broken rig, all of them any other state.
         if len(self.views) < RECENT_VIEWS or self.state is RigState.EXCHANGED:
             return
-        finding = judge(list(islice(self.views, len(self.views) - RECENT_VIEWS, None)), self._cylinder)
-        if finding.misfit_deg <= BROKEN_DEG:
+        finding = judge(list(self.views)[-RECENT_VIEWS:], self._cylinder)
+        if finding.state is not RigState.BROKEN:
             if len(self.views) < VIEWS:
                 return
             finding = judge(list(self.views), self._cylinder)

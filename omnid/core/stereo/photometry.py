@@ -21,9 +21,7 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought.
-LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene
-NOTHING_BUT_NOISE = 0.5  # contrast to noise, because corners and patches are then those of noise
-LEAST_NOISE_GREY = 0.3  # Standard deviation of rounding: 1 / sqrt(12).
+LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene; below half of it corners are noise
 # Brightness of one panorama by the other's, above which nothing is changed: at 0.88 poses are as exact as at 1, at 0.85
 # they were degraded, at 0.8 lost.
 SAME_BRIGHTNESS = 0.87
@@ -39,7 +37,6 @@ SMOOTHEST_PERCENT = 5.0
 # bilinearly.
 NOISE_SCALE = 6.1
 BANDS, BAND_ROWS = 4, 24  # rows in which noise is measured: all would take milliseconds
-MIN_BLOCKS = 20  # With fewer visible blocks the noise is unknown, because the smoothest of few have texture.
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +54,7 @@ class Light:
     @property
     def shows_nothing(self) -> bool:
         """True if the corners of a dim image are noise, so that a map of them would be wrong."""
-        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < NOTHING_BUT_NOISE
+        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < LEAST_CONTRAST_TO_NOISE / 2
 
 
 def light(sums: TileSums, noise_grey: float) -> Light:
@@ -65,7 +62,7 @@ def light(sums: TileSums, noise_grey: float) -> Light:
     pixels = max(1, int(sums.pixels.sum()))
     mean, square = (float(total.sum(dtype=np.int64)) / pixels for total in (sums.grey, sums.square))
     contrast = math.sqrt(max(0.0, square - mean**2 - noise_grey**2))
-    return Light(mean, contrast / max(noise_grey, LEAST_NOISE_GREY))
+    return Light(mean, contrast / max(noise_grey, MEASURED_NOISE_GREY))
 
 
 def gain_of(level: float) -> float:
@@ -95,7 +92,10 @@ def brightened(panorama: Image, gain: float) -> Image:
 
 
 def noise_sigma(panorama: Image, visible: Flags) -> float:
-    """Return the standard deviation of the noise [grey levels] of a panorama (H, W) where it is visible (H, W)."""
+    """Return the standard deviation of the noise [grey levels] of a panorama (H, W) where it is visible (H, W).
+
+    MEASURED_NOISE_GREY where no block is visible.
+    """
     means = []
     for top in np.linspace(0, max(0, len(panorama) - BAND_ROWS), BANDS).astype(int).tolist():
         band = panorama[top : top + BAND_ROWS].astype(np.float32)
@@ -104,9 +104,7 @@ def noise_sigma(panorama: Image, visible: Flags) -> float:
         magnitude, share = _blocks(np.abs(difference)), _blocks(shown)
         means.append(magnitude[share == 1])
     found = np.concatenate(means)
-    return (
-        MEASURED_NOISE_GREY if len(found) < MIN_BLOCKS else NOISE_SCALE * float(np.percentile(found, SMOOTHEST_PERCENT))
-    )
+    return NOISE_SCALE * float(np.percentile(found, SMOOTHEST_PERCENT)) if len(found) else MEASURED_NOISE_GREY
 
 
 def _blocks(image: NDArray[np.float32]) -> NDArray[np.float32]:
