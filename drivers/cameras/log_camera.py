@@ -1,53 +1,43 @@
-"""A recorded log that replaces live cameras, wheels and IMU: at a chosen pace, stamped with the time of delivery."""
+"""A recorded log that replaces live cameras: at a chosen pace, stamped with the time of delivery."""
 
 from __future__ import annotations
 
 import math
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Final, TypeAlias, TypeVar
+from typing import Final, TypeAlias
 
 from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.log_reader import BY_NAME, LogCameras, LogReader
-from drivers.logs.streams import MotionTopics
-from drivers.motion import MotionSample
 
 MAX_LOG_BYTES: Final = 1 << 30
 MAX_DELAY_NS: Final = 100_000_000  # a frame later than that is dropped, as by a camera whose buffers are full
-T = TypeVar("T")
 TimedFrames: TypeAlias = tuple[tuple[int, Frame], ...]  # time since the log's first frame [ns], frame
 
 
 @dataclass(frozen=True, slots=True)
 class LogImages:
-    """The frames of both cameras of a log in memory, and the samples of its wheels and IMU."""
+    """The frames of both cameras of a log in memory."""
 
     lower: TimedFrames
     upper: TimedFrames
-    motion: tuple[tuple[int, MotionSample], ...] = ()  # time since the log's first frame [ns], sample
     warnings: tuple[str, ...] = ()  # of the reader, a line each
 
     @staticmethod
-    def load(path: Path, cameras: LogCameras = BY_NAME, motion: MotionTopics | None = None) -> LogImages:
-        """Load the images of a log; motion: topics of wheels and IMU; None: they are not read.
-
-        Raises DriverError where a camera has fewer than two images, and beyond MAX_LOG_BYTES.
-        """
-        frames, samples, left_bytes = list[Frame](), list[MotionSample](), MAX_LOG_BYTES
-        with closing(LogReader(path, cameras, motion=motion)) as reader:
-            for message in reader.messages():
-                if not isinstance(message, Frame):
-                    samples.append(message)
-                    continue
-                frames.append(message)
-                left_bytes -= len(message.data)  # LogReader delivers bytes
+    def load(path: Path, cameras: LogCameras = BY_NAME) -> LogImages:
+        """Load the images of a log; DriverError where a camera has fewer than two images, and beyond MAX_LOG_BYTES."""
+        frames, left_bytes = list[Frame](), MAX_LOG_BYTES
+        with closing(LogReader(path, cameras)) as reader:
+            for frame in reader.frames():
+                frames.append(frame)
+                left_bytes -= len(frame.data)  # LogReader delivers bytes
                 if left_bytes < 0:
                     most = MAX_LOG_BYTES >> 20
                     raise DriverError(f"{path}: more than {most} MiB of images: cut the log into shorter ones")
@@ -61,8 +51,7 @@ class LogImages:
                 f"{path}: {len(lower_frames)} images of the lower and {len(upper_frames)} of the "
                 "upper camera: give a log with two or more of each"
             )
-        timed = tuple((sample.stamp_ns - first_ns, sample) for sample in samples)
-        return LogImages(lower_frames, upper_frames, timed, tuple(reader.warnings))
+        return LogImages(lower_frames, upper_frames, tuple(reader.warnings))
 
     @property
     def last_ns(self) -> int:
@@ -76,7 +65,7 @@ class LogImages:
 
 
 class LogPlayback:
-    """A log that is played forwards and backwards in turn, for its cameras and its motion.
+    """A log that is played forwards and backwards in turn, for both cameras.
 
     It starts when the first of them begins to deliver: a run that loads for some time before it takes images loses
     none of them.
@@ -97,24 +86,24 @@ class LogPlayback:
                 self._epoch_ns = time.monotonic_ns()
             return self._epoch_ns
 
-    def due(self, entries: Sequence[tuple[int, T]], closed: threading.Event) -> Iterator[tuple[int, T, int]]:
-        """Yield stamp [ns], entry and direction (1, or -1 on the way back) when each entry is due, until closed."""
+    def due(self, frames: TimedFrames, closed: threading.Event) -> Iterator[tuple[int, Frame]]:
+        """Yield stamp [ns] and frame when each frame is due, until closed."""
         epoch_ns = self.epoch_ns()
-        for at_ns, entry, direction in self._passes(entries):
+        for at_ns, frame in self._passes(frames):
             stamp_ns = epoch_ns + round(at_ns / self.pace)
             if closed.wait(max(0.0, (stamp_ns - time.monotonic_ns()) * 1e-9)):
                 return
-            yield stamp_ns, entry, direction
+            yield stamp_ns, frame
 
-    def _passes(self, entries: Sequence[tuple[int, T]]) -> Iterator[tuple[int, T, int]]:
-        """Yield time since the epoch at pace 1 [ns], entry and direction, pass after pass."""
+    def _passes(self, frames: TimedFrames) -> Iterator[tuple[int, Frame]]:
+        """Yield time since the epoch at pace 1 [ns] and frame, pass after pass."""
         images = self.images
         for start_ns in count(0, 2 * images.pass_ns):
-            yield from ((start_ns + at_ns, entry, 1) for at_ns, entry in entries)
+            yield from ((start_ns + at_ns, frame) for at_ns, frame in frames)
             if self._once:
                 return
             turned_ns = start_ns + images.pass_ns + images.last_ns
-            yield from ((turned_ns - at_ns, entry, -1) for at_ns, entry in reversed(entries))
+            yield from ((turned_ns - at_ns, frame) for at_ns, frame in reversed(frames))
 
 
 class LogCamera:
@@ -128,7 +117,7 @@ class LogCamera:
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames when they are due, until closed; those that are not read in time are dropped and counted."""
-        for seq, (stamp_ns, frame, _) in enumerate(self._playback.due(self._entries, self._closed)):
+        for seq, (stamp_ns, frame) in enumerate(self._playback.due(self._entries, self._closed)):
             if time.monotonic_ns() <= stamp_ns + MAX_DELAY_NS:
                 self.state.status = "streaming"
                 self.state.frames += 1
@@ -139,23 +128,4 @@ class LogCamera:
 
     def close(self) -> None:
         """End the frames; may be called twice, from any thread."""
-        self._closed.set()
-
-
-class LogMotion:
-    """Wheels and IMU of a log, played as its cameras are: on the way back all rates have the other sign."""
-
-    def __init__(self, playback: LogPlayback) -> None:
-        self._playback, self._closed = playback, threading.Event()
-
-    def samples(self) -> Iterator[MotionSample]:
-        """Yield the samples when they are due, until closed."""
-        motion = self._playback.images.motion
-        for stamp_ns, sample, direction in self._playback.due(motion, self._closed) if motion else ():
-            rates = [name for name in sample.__slots__ if name.endswith("ps")]
-            faster = {name: direction * self._playback.pace * getattr(sample, name) for name in rates}
-            yield replace(sample, stamp_ns=stamp_ns, **faster)
-
-    def close(self) -> None:
-        """End the samples; may be called twice, from any thread."""
         self._closed.set()

@@ -16,7 +16,7 @@ import numpy as np
 from calib import se3
 from calib.rig_file import read_rig, rig_toml
 from calib.se2_arrays import transform
-from drivers.cameras.log_camera import LogCamera, LogImages, LogMotion, LogPlayback
+from drivers.cameras.log_camera import LogCamera, LogImages, LogPlayback
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.commands import options
 from omnid.config import Config
@@ -30,7 +30,7 @@ from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.live import ConnectedRobot, record_frames, run_live
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.runs.session import attached_rig, motion_topics
+from omnid.runs.session import attached_rig
 from omnid.simulation.demonstration import demonstrate
 from omnid.simulation.paced_robot import PacedRobot
 from omnid.simulation.robot import make_robot
@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
     --rig FILE [cameras.rig]   the rig.toml of the cameras; default: that attached to the log, or without --log
         cameras.rig of the settings
     --motor PORT [motor.port]  serial port of the controller, or 'simulated'
-    --log LOG                  use the images of a log instead of cameras, for a trial: in real time, forwards and
-        backwards until it is stopped
+    --log LOG                  use the images of a log instead of cameras, for a trial without wheels and gyro: in real
+        time, forwards and backwards until it is stopped
     --lower DEVICE|TOPIC       device of the lower camera; default: cameras.lower of the settings; with --log the topic
         of its images, default: found by name
     --upper DEVICE|TOPIC       the same of the upper camera
@@ -69,16 +69,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_log(args: argparse.Namespace, config: Config) -> int:
-    """Run on the images of a log, and on its wheels and gyro: no others fit these images."""
+    """Run on the images of a log."""
     cameras = LogCameras(args.lower, args.upper, config.cameras.bits)
-    images = LogImages.load(args.log, cameras, motion_topics(config))
+    images = LogImages.load(args.log, cameras)
     for warning in images.warnings:
         log(logging.WARNING, warning)
     playback, rig = LogPlayback(images, pace=args.pace, once=args.once), None
     if not args.rig:
         with closing(LogReader(args.log, cameras)) as reader:
             rig = attached_rig(reader, args.log)
-    run_live(config, ConnectedRobot(partial(LogCamera, playback), partial(LogMotion, playback)), log, rig)
+    run_live(config, ConnectedRobot(partial(LogCamera, playback), plays_log=True), log, rig)
     return 0
 
 

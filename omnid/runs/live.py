@@ -22,7 +22,6 @@ from typing import Final, Protocol, TypeAlias
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
-from drivers.cameras.log_camera import LogMotion
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.logs.rotating_log import RotatingLog
 from drivers.motor import VelocityCommand
@@ -84,13 +83,13 @@ class LiveRobot(Protocol):
     """A robot, or a simulated one, as a live run sees it."""
 
     waits: bool  # its time is stopped until the run has answered: nothing is dropped or omitted under load
-    brings_samples: bool  # wheels and gyro come with the images: no others fit them
+    brings_samples: bool  # wheels and gyro come with the images, or not at all: no others fit them
     states: Mapping[Camera, CameraState]  # of the cameras, once they are open
 
     def clock_ns(self) -> int:
         """Return the time, by the clock of the stamps of images, poses and ticks [ns]."""
 
-    def connect(self, session: Session, motion: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink | None]:
+    def connect(self, session: Session, motion: MotionInbox, /) -> tuple[list[Stream[Frame]], DriveLink | None]:
         """Open the cameras and start the controller; return the sources of the images, and None without wheels.
 
         Outputs of the session close them. motion: takes the samples that come with the images.
@@ -102,26 +101,20 @@ class ConnectedRobot:
 
     waits = False
 
-    def __init__(self, open_camera: OpenCamera, open_motion: Callable[[], LogMotion] | None = None) -> None:
-        """open_motion: of wheels and gyro where the images are those of a log, called when the cameras were opened for
-        the run; None: those of the robot.
-        """
-        self._open_camera, self._open_motion = open_camera, open_motion
-        self.brings_samples = open_motion is not None
+    def __init__(self, open_camera: OpenCamera, *, plays_log: bool = False) -> None:
+        """plays_log: the images are those of a log, and samples of wheels and gyro are not used."""
+        self._open_camera, self.brings_samples = open_camera, plays_log
         self.states: Mapping[Camera, CameraState] = {}
 
     def clock_ns(self) -> int:
         """Return CLOCK_MONOTONIC."""
         return time.monotonic_ns()
 
-    def connect(self, session: Session, motion: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink | None]:
+    def connect(self, session: Session, _: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink | None]:
         """Open the cameras, and start the controller process where there is a motor."""
         graph, outputs = session.graph, session.outputs
         cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
         self.states = {name: camera.state for name, camera in cameras.items()}
-        if self._open_motion is not None:
-            samples = self._open_motion()
-            graph.source("motion", partial(map, motion.add, samples.samples()), wake=samples.close)
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
         return frames, session.start_controller(session.config.realtime) if session.config.motor.port else None
 

@@ -19,6 +19,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.frame import Frame
 from drivers.logs.log_reader import WHOLE, LogCameras, LogReader
+from drivers.logs.streams import MotionTopics
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE
@@ -38,7 +39,7 @@ from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.files import RunPlaces
-from omnid.runs.session import Session, attached_rig, motion_topics, run_to_end
+from omnid.runs.session import Session, attached_rig, run_to_end
 from omnid.runs.wiring import Inputs, Outputs, WiredStages, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
@@ -173,7 +174,9 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         given = read_rig(options.rig) if isinstance(options.rig, Path) else options.rig
         cameras = LogCameras(*options.topics, config.cameras.bits, config.log.rate_hz, config.log.time)
         topics = given.topics if given else ("", "")
-        reader = LogReader(log, cameras, topics, span_s=options.span_s, motion=motion_topics(config))
+        named_motion = {"auto": None, "off": ""}  # None: the only topic of the log, "": none
+        motion = MotionTopics(*(named_motion.get(name, name) for name in (config.motion.wheels, config.motion.imu)))
+        reader = LogReader(log, cameras, topics, span_s=options.span_s, motion=motion)
         closing.callback(reader.close)
         geometry = session.geometry(given or attached_rig(reader, log), reader.frames())
         prepare_kernels()

@@ -13,7 +13,6 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig, rig_toml
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
-from drivers.logs.streams import MotionTopics
 from omnid.config import Config
 from omnid.controller.ipc import ControllerStart
 from omnid.controller.link import ControllerLink
@@ -44,13 +43,6 @@ def attached_rig(reader: LogReader, log: object) -> Rig:
             "import camchain.yaml -o rig.toml`"
         )
     return parse_rig(attached, None, f"{log}: attached rig.toml")
-
-
-def motion_topics(config: Config) -> MotionTopics:
-    """Return the topics of a log to read."""
-    named = {"auto": None, "off": ""}  # None: the only topic of the log, "": none
-    wheels, imu = (named.get(topic, topic) for topic in (config.motion.wheels, config.motion.imu))
-    return MotionTopics(wheels, imu)
 
 
 def run_to_end(graph: Graph, run_places: RunPlaces) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,13 +24,11 @@ from omnid.runs.replay import ReplayOptions, RunResult, run_log
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import decode_diagnostics
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
-from omnid.transport.status_names import MOTION, REFUSED_PREFIX
+from omnid.transport.status_names import MOTION
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 from tests.replay.edited import dark, images
-from tests.replay.live import robot
 from tests.simulation.logs import SensorErrors, motion_samples
-from tests.waiting import wait_until
 
 DARK = range(12, 18)
 ERRORS = SensorErrors(distance=1.02, turn=0.97, wheel_offset_s=0.01, bias_radps=(0.0, 0.0, 0.01))
@@ -154,17 +151,3 @@ def test_a_pose_that_the_wheels_contradict_is_degraded_and_its_sigma_covers_thei
     sigma_m, honest_m = (np.sqrt(np.diag(result.covariances[-1])[:3].max()) for result in (contradicted, honest))
     travelled_m = float(np.linalg.norm(contradicted.T_odom_rig[-1, :3, 3]))
     assert 0.3 * 0.7 * travelled_m < sigma_m < 0.7 * travelled_m and honest_m < 0.02
-
-
-def test_the_daemon_on_a_log_reads_its_wheels_and_gyro_and_no_others(log: Path, scene: Path, tmp_path: Path) -> None:
-    for name, source in (("log.mcap", log), ("rig.toml", scene / "rig.toml")):
-        shutil.copy(source, tmp_path / name)
-    with robot(tmp_path, tmp_path, "--set", "obstacles.enabled=false") as (daemon, operator, _):
-        wait_until(lambda: float(operator.values("wheels and gyro").get("gyro_samples", 0)) > 150, "samples")
-        values = operator.values("wheels and gyro")
-        # The gyro of the log measures twice as often as its wheels; the motor's reports would come besides.
-        assert float(values["wheel_samples"]) == pytest.approx(float(values["gyro_samples"]) / 2, rel=0.1)
-        operator.send("cmd/imu", gyro_cdr(GyroSample(1, 0.0, 0.0, 0.0), 10**18))
-        wait_until(lambda: operator.values("wheels and gyro").get(f"{REFUSED_PREFIX}not available") == "1", "a refusal")
-        code, err = daemon.end()
-    assert code == 0 and "Traceback" not in err

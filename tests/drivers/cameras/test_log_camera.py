@@ -5,16 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import closing
-from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogImages, LogMotion, LogPlayback
+from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogImages, LogPlayback
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
-from drivers.motion import GyroSample, WheelSample
 from tests.conftest import PAIRS
 
 FAST = 50.0
@@ -42,29 +40,13 @@ def test_plays_forwards_and_backwards_at_even_intervals(recorded: LogImages) -> 
     pace, open_end = 1000.0, threading.Event()
     playback = LogPlayback(recorded, pace=pace)
     lower, upper = (
-        [pace * stamp_ns for stamp_ns, _, _ in islice(playback.due(entries, open_end), 6 * PAIRS)]
+        [pace * stamp_ns for stamp_ns, _ in islice(playback.due(entries, open_end), 6 * PAIRS)]
         for entries in (recorded.lower, recorded.upper)
     )
     steps_ns = [b - a for a, b in pairwise(lower)]
     assert min(steps_ns) > 80e6 and max(steps_ns) < 120e6
     apart_ns = [abs(a - b) for a, b in zip(lower, upper, strict=True)]
     assert max(apart_ns) < 5e6, "both cameras reverse at the same time"
-
-
-def test_wheels_and_gyro_are_played_with_the_images_and_backwards_on_the_way_back(recorded: LogImages) -> None:
-    samples = (WheelSample(0, 0.3, 0.1), GyroSample(0, 0.0, -0.1, 0.2))
-    log = replace(recorded, motion=tuple(zip((10_000_000, 50_000_000), samples, strict=True)))
-    source = LogMotion(playback := LogPlayback(log, pace=FAST))
-    first, second, third, fourth = islice(source.samples(), 4)
-    epoch_ns = playback.epoch_ns()
-    assert first == WheelSample(epoch_ns + round(10e6 / FAST), FAST * 0.3, FAST * 0.1)
-    assert second == GyroSample(epoch_ns + round(50e6 / FAST), 0.0, -0.1 * FAST, 0.2 * FAST)
-    assert isinstance(third, GyroSample) and isinstance(fourth, WheelSample)
-    assert (third.z_radps, fourth.velocity_mps) == pytest.approx((-0.2 * FAST, -0.3 * FAST))
-    assert third.stamp_ns == epoch_ns + round((recorded.pass_ns + recorded.last_ns - 50e6) / FAST)
-    assert len(list(LogMotion(LogPlayback(log, pace=FAST, once=True)).samples())) == 2
-    source.close()
-    assert list(source.samples()) == list(LogMotion(LogPlayback(recorded)).samples()) == []
 
 
 def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) -> None:
