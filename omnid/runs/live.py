@@ -116,7 +116,7 @@ class ConnectedRobot:
         cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
         self.states = {name: camera.state for name, camera in cameras.items()}
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
-        return frames, session.start_controller(session.config.realtime) if session.config.motor.port else None
+        return frames, session.start_controller() if session.config.motor.port else None
 
 
 def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None = None) -> RobotClock:

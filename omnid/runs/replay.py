@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,6 @@ from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warn
 from omnid.diagnostics.status import stage_stats
 from omnid.engine.graph import Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.process import RealtimeSettings
 from omnid.engine.telemetry import SummaryRow
 from omnid.engine.threads import POLL_S, sleep_until
 from omnid.errors import OmnidError
@@ -54,7 +53,6 @@ from omnid.transport.codec import Diagnostics
 from omnid.transport.status_names import MOTION, entry, stage_name
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
-UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +209,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             recorder = Recorder(SingleLog(options.record, attachments), config.bus.robot, session.encoder(rig))
             closing.callback(recorder.close)
         if config.motor.port:
-            controller = session.start_controller(UNPRIVILEGED, of_replay=True)
+            controller = session.start_controller(of_replay=True)
             wheels = ReplayDrive(controller, config.controller.setpoint.setpoint(), rig.T_base_rig, front_end.health)
             outputs.counters["controller"] = wheels
         if options.publish:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from typing import Final
 
 import cv2
@@ -18,7 +19,6 @@ from omnid.controller.ipc import ControllerStart
 from omnid.controller.link import ControllerLink
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
-from omnid.engine.process import RealtimeSettings
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import Poller, started
@@ -108,14 +108,17 @@ class Session:
         bus.serve("rig", rig_toml(rig))
         return bus
 
-    def start_controller(self, realtime: RealtimeSettings, *, of_replay: bool = False) -> ControllerLink:
+    def start_controller(self, *, of_replay: bool = False) -> ControllerLink:
         """Start the controller process; DriverError where its settings cannot be used.
 
-        A live run waits for its motor controller as for its cameras, while a replay needs it at once: DriverError.
-        The wheels stop, and the process ends, at the latest with `outputs`.
+        A live run waits for its motor controller as for its cameras, while a replay needs it at once: DriverError. The
+        process of a replay has no privileges. The wheels stop, and the process ends, at the latest with `outputs`.
         """
-        settings = self.config.controller.of_replay if of_replay else self.config.controller
-        settings = settings if self.config.obstacles.enabled else settings.without_obstacles
+        settings, realtime = self.config.controller, self.config.realtime
+        if of_replay:
+            settings, realtime = settings.of_replay, replace(realtime, lock_memory=False, motor_priority=0)
+        elif not self.config.obstacles.enabled:
+            settings = settings.without_obstacles
         start = ControllerStart(self.config.motor, settings, realtime, waits=of_replay)
         link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor", is_ticker=True)), self.warn)
         self.outputs.callback(link.close)
