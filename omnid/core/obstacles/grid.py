@@ -60,8 +60,8 @@ class GridParameters:
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
     shown_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
-    shown_least: float = 0.025  # mean from which something hangs there,
-    shown_weight: float = 100.0  # and its log-odds by this mean
+    shown_least: float = 0.08  # mean from which something hangs there,
+    shown_weight: float = 30.0  # and its log-odds by this mean
 
 
 CELL_M: Final = kernels.CELL_M
@@ -191,8 +191,8 @@ class ObstacleGrid:
         updated = np.clip(p.prior + np.float32(keep) * (self.odds - p.prior) + change, p.arrival, p.most)
         self.odds[:] = np.where(in_view, updated, self.odds)
         self._before[:] = np.where(in_view, found[kernels.RATIO], 0)
-        shown = cv2.blur(found[kernels.SURFACE], (5, 5))
-        self._shown += np.where(in_view, np.float32(p.shown_rate * (1 - rho)) * (shown - self._shown), 0)
+        shown = np.float32(p.shown_rate * (1 - rho)) * (found[kernels.SURFACE] - self._shown)
+        self._shown += np.where(in_view, shown, 0)
         # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
         #    known after so many more views past it.
         self._past_views[past] += np.float32(1 - rho)
@@ -330,7 +330,9 @@ class ObstacleGrid:
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
         p = self._p
-        hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.prior)
+        around = cv2.blur(self._shown, (5, 5))
+        hanging = np.clip(p.shown_weight * (around - p.shown_least), -9.0, 6.0) + np.float32(p.prior)
+        hanging[self._shown < around] = p.arrival  # it is where most is shown of what is around
         taken = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
         return np.where((self._known > 0) | (self.odds > 0), taken, np.float32(2))
 

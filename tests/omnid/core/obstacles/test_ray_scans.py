@@ -10,7 +10,7 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
-from omnid.core.obstacles.grid import GridScan
+from omnid.core.obstacles.grid import CELL_M, OCCUPIED, GridScan
 from omnid.core.obstacles.ray_scans import RayScans
 from omnid.core.obstacles.settings import ScanSettings
 from tests.omnid.core.obstacles.drawn_floor import (
@@ -99,6 +99,17 @@ def test_floor_behind_a_plain_thing_is_not_free(case: Case) -> None:
     assert scan.free_m[AHEAD].max() < max(case.thing.range_m, 0.3) + 0.15
     if isinstance(case.thing, Pole):
         assert np.median(scan.free_m[BEHIND]) > 0.75 * WALL_M
+
+
+@pytest.mark.parametrize("floor", [plain, worn, stains])
+def test_what_hangs_is_where_it_is_seen(floor: Pattern) -> None:
+    """Cells around it, to which its evidence belongs as well, stay free."""
+    scan = Standing(floor).scan(Bar(1.4, (0.5, 0.56)), pairs=20)
+    assert scan.grid is not None
+    cells = np.argwhere(scan.grid.states == OCCUPIED)[:, ::-1] + 0.5
+    ranges_m = np.linalg.norm(scan.grid.corner_m + CELL_M * cells, axis=1)
+    away_m = np.abs(ranges_m[ranges_m < 2.2] - 1.4)
+    assert len(away_m) > 200 and np.quantile(away_m, 0.95) < 0.125
 
 
 @pytest.mark.hazard("H19")
