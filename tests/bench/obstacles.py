@@ -2,7 +2,8 @@
 
 Two tables follow from the same command. The first: how far the robot drove where nothing was in the way. The second:
 what it touched where something was, and whether it stopped 0.05 to 0.8 m before that, or passed. A drive is asked to go
-straight on, to turn towards the hazard (--turning), or to a goal; it ends there, or where it has stood for a while.
+straight on, to turn towards the hazard (--turning), or to a goal; it ends there, where it has stood for a while, or
+where the navigation gives up.
 Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the commit is the same.
 
 With --open-loop FOLDER, pairs along the way are kept there with the truth, made by a base that nothing stops, and what
@@ -129,11 +130,10 @@ class Asker:
             self._start, self.began_s, self._stood = place.copy(), moment.time_s, (moment.time_s, place.copy())
         if np.linalg.norm(place - self._stood[1]) > STANDS_M:
             self._stood = moment.time_s, place.copy()
-        if moment.time_s - self._stood[0] > self._stands_s:
-            yield "end"
         if self._asked.goal is None:
             yield self._setpoint
-            if np.linalg.norm(place - self._start) >= self._asked.way_m:
+            stands = moment.time_s - self._stood[0] > self._stands_s
+            if stands or np.linalg.norm(place - self._start) >= self._asked.way_m:
                 yield "end"
         elif math.isinf(self._sent_s):
             self._sent_s = moment.time_s

@@ -56,6 +56,7 @@ class Detour(NamedTuple):
 
     follower: Follower  # in odom
     time_s: float  # for all of it
+    length_m: float  # of all of it
     leg: int = 0  # of the path, to which it leads back
     s_m: float = 0.0  # on that leg
 
@@ -86,6 +87,7 @@ class Drive:
     ways: int = 0  # number of ways that were begun since then
     searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why that search found none
+    move: Move | None = None  # kind of the newest motion that was wanted
     is_waiting: bool = False  # a way around is known that takes longer than what it has waited is worth
 
     @property
@@ -279,6 +281,8 @@ class Navigator:
         drive.resets = now.resets
         # 2. The way.
         following = drive.step(now, self._room_m(drive, now))
+        move = _kind(following.setpoint)
+        drive.move = drive.move if move is None else move
         if following.done:
             return self._finished(drive, following.missed_m)
         if abs(following.offset_m) > settings.corridor_m + self._planner.room_m:
@@ -352,7 +356,9 @@ class Navigator:
             following = drive.step(now, self._room_m(drive, now))
             wanted = following.setpoint
             first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), room_m, *look)
-        # 2. Without a way around it, drive up to the obstacle and wait.
+        # 2. Without another way, wait: on a detour that is closed at once, on the path in front of the obstacle.
+        if first_m < math.inf and drive.detour is not None and drive.no_way:
+            return following, None, CROSSES if around.moves else STANDS
         left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
         braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
         if wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps:  # the base has reached the obstacle
@@ -366,7 +372,7 @@ class Navigator:
     ) -> bool:
         """True if the base begins another way; is_closed: an obstacle is or will be on the present one.
 
-        A long way around an obstacle is chosen only after a wait as long as the time it costs: it is unknown when the
+        A long way around an obstacle is chosen only after a wait as long as it takes longer: it is unknown when the
         present way is free again, and so at most twice the least time is lost (the ski rental problem).
         """
         detour, settings, path = drive.detour, self.settings, drive.paths[0]
@@ -383,7 +389,7 @@ class Navigator:
         drive.searched_ns, drive.is_waiting = now.stamp_ns, False
         if is_blocked and detour is not None:
             drive.tried_s, drive.way_s = drive.tried_s + drive.way_s, 0.0
-        found = self._search(drive, now, around, _kind(following.setpoint) if now.wheels.held_by else None)
+        found = self._search(drive, now, around, drive.move if now.wheels.held_by else None)
         if not isinstance(found, str) and is_blocked and drive.ways >= MOST_WAYS:
             found = f"{drive.ways} ways were tried"
         if isinstance(found, str):
@@ -392,9 +398,8 @@ class Navigator:
         drive.no_way = ""
         if is_blocked:
             may_leave = is_closed and (detour is None or around.moves)
-            free_s = self._planner.free_s(drive.ahead(now, following.left_m), around)
-            worth_s = free_s + LOOK_M / settings.pursuit.velocity_mps + drive.lost_s
-            drive.is_waiting = may_leave and found.time_s > worth_s
+            worth_m = following.left_m + LOOK_M + settings.pursuit.velocity_mps * drive.lost_s
+            drive.is_waiting = may_leave and found.length_m > worth_m
             if drive.is_waiting:
                 return False
             drive.ways += 1
@@ -428,7 +433,8 @@ class Navigator:
         )
         if isinstance(found, str):
             return found
-        return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found.time_s, *place)
+        length_m = found.path.length_m + math.dist(found.path.goal, goal)
+        return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found.time_s, length_m, *place)
 
     def _blocked(
         self, drive: Drive, reason: str, following: Following, dt_s: float, setpoint: Setpoint | None
@@ -471,8 +477,10 @@ def _behind(path: Array, is_blocked: NDArray[np.bool_]) -> int | None:
     return None
 
 
-def _kind(setpoint: Setpoint) -> Move:
-    """Return the kind of a motion."""
+def _kind(setpoint: Setpoint) -> Move | None:
+    """Return the kind of a motion, None for none."""
+    if setpoint == STAND:
+        return None
     if setpoint.velocity_mps == 0.0:
         return Move.TURN
     return Move.AHEAD if setpoint.velocity_mps > 0.0 else Move.BACK

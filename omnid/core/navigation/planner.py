@@ -85,12 +85,6 @@ class Planner:
             and around.room_at(leg.xy, distances_m(around.is_unknown)).min() >= room_m
         )
 
-    def free_s(self, xy: Array, around: Surroundings) -> float:
-        """Return the time along points (N, 2), if nothing stood on them."""
-        is_known = around.room_at(xy[1:], np.where(around.is_unknown, 0.0, 1.0)) == 1.0
-        speeds_mps = np.where(is_known, self._settings.pursuit.velocity_mps, UNKNOWN_MPS)
-        return float((np.hypot(*np.diff(xy, axis=0).T) / speeds_mps).sum())
-
     def way(
         self,
         pose: Array,
@@ -170,7 +164,8 @@ class Planner:
         # 1. By the speed that is driven at this distance from obstacles, and through floor that was not seen.
         pursuit, room_m = self._settings.pursuit, around.closed_m
         gap = (room_m - self._half_width_m) / pursuit.slow_obstacle_m
-        speed_mps = pursuit.velocity_mps * np.clip(gap, pursuit.least_mps / pursuit.velocity_mps, 1.0)
+        # What is passed at the least speed costs more where it is nearer, so that the way is in the middle of a gap.
+        speed_mps = pursuit.velocity_mps * np.clip(gap, MARGIN_M / pursuit.slow_obstacle_m, 1.0)
         speed_mps[around.is_unknown] = np.minimum(speed_mps[around.is_unknown], UNKNOWN_MPS)
         # 2. A base that begins too near to something may leave, as far as it gets no nearer.
         rows, columns = np.indices(room_m.shape)
