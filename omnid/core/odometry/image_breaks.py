@@ -32,7 +32,7 @@ from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.line_times import CAMERAS, LAG_S, LEAST_PX, MEMORY_S, SETS, LineTimes, RawImage, camera_names
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
-from omnid.core.odometry.plane_patches import WINDOW_PX
+from omnid.core.odometry.plane_patches import WINDOW_PX, align, plane_templates
 from omnid.core.odometry.pose_estimation import CORRELATED, GAUSS_NEWTON_STEPS, cost
 from omnid.core.odometry.pose_kernels import VIEW
 from omnid.core.odometry.tracking import KltSettings, track
@@ -222,6 +222,7 @@ def _flow(
     landmarks, _ = local_map.visible(last.T_odom_rect)
     landmarks = landmarks[:: max(1, -(-len(landmarks) // MOST))]
     points, covariance = local_map.table.points[landmarks], local_map.table.covariance[landmarks]
+    slopes = local_map.slopes(last.T_odom_rect, landmarks)
     seen = [se3.apply(se3.inverse(each.T_odom_rect), points) for each in views]
     shifts = [each.exposure.shift(at) for each, at in zip(views, seen, strict=True)]
     pixels = [view(at, cylinder, baseline_m) for at in seen]
@@ -231,7 +232,7 @@ def _flow(
     parts, sought = [], 0
     for camera, raw_image in enumerate(raws):
         # 1. Landmarks that both pairs show, tracked from where the step predicts them, else as if the rig had stood, as
-        #    torn images show them.
+        #    torn images show them. Their patches are aligned, bent as the step bends them.
         own = [0, 1 + camera]
         start, end = (at[:, own] - (shift.lower, shift.upper)[camera] for at, shift in zip(pixels, shifts, strict=True))
         raw, by_raw = raw_image.at(end)
@@ -246,6 +247,20 @@ def _flow(
             rest = rows[~found[rows]]
             tracked, ok = track(last.pair[camera], now.pair[camera], start[rest], guess[rest], FAR)
             there[rest[ok]], found[rest[ok]] = tracked[ok], True
+        # The upper camera is like a lower one whose frame is higher, in which slopes are those over its own rows.
+        up, bent = np.eye(4), slopes[rows] / (1.0 + camera * slopes[rows, 1:])
+        up[2, 3] = -camera * baseline_m
+        T_now_last = np.tile(up @ se3.inverse(now.T_odom_rect) @ last.T_odom_rect @ se3.inverse(up), (len(rows), 1, 1))
+        of_last = (
+            {0: last.pair[camera]},
+            np.zeros(len(rows), np.intp),
+            start[rows],
+            (se3.apply(up, seen[0][rows]), bent),
+        )
+        templates = plane_templates(*of_last, T_now_last, model, there[rows])
+        aligned = align(templates, now.pair[camera], there[rows])
+        is_aligned = rows[aligned.found]
+        there[is_aligned], found[is_aligned] = aligned.pixels[aligned.found], True
         rows = np.flatnonzero(found)
         d = there[rows] - end[rows]
         d[:, 0] = cylinder.wrap(d[:, 0])
