@@ -138,11 +138,6 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         session = Session(config, graph, outputs, warn, clock)
         # 1. The rig, and what is compiled or imported before the first image.
         geometry = session.geometry(rig or read_rig(Path(config.cameras.rig)), ())
-        if geometry.rig.height_m(config.obstacles.scan.floor_m) is None:
-            warn(
-                "the rig states no height of the cameras: the floor is looked for in the images; "
-                f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
-            )
         compile_serialisers(
             [*(topic.schema for topic in topics.PUBLISHED.values()), *topics.command_topics(()).values()]
         )
@@ -152,6 +147,11 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         # 2. The connections, and the stages between them.
         health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
         run_places = _join(session, FrontEnd(geometry, config, health), robot, report)
+        if geometry.rig.height_m(config.obstacles.scan.floor_m) is None:
+            warn(
+                "the rig states no height of the cameras: the floor is looked for in the images; "
+                f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
+            )
         # 3. The status line of systemd and of a terminal.
         outputs.callback(HANDLER.show, "")
         outputs.callback(notify, "STOPPING=1", "STATUS=stopping")

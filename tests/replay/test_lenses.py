@@ -110,7 +110,7 @@ def test_stitched_images_are_imported_replayed_and_right_to_a_thousandth(
 ) -> None:
     rig, found = tmp_path / "rig.toml", tmp_path / "out.txt"
     made = omnid("calibrate", "import", "--equirectangular", "1440x720", "--baseline", BASELINE_M, "-o", rig)
-    assert made.code == 0 and "equirectangular 1440x720" in made.out and "baseline 191.0 mm" in made.out
+    assert made.code == 0 and "lower equirectangular" in made.out and "baseline 191.0 mm" in made.out
     done = omnid("replay", recording, "--rig", rig, "--quiet", "--tum", found)
     assert done.code == 0 and "tracking 100.0%" in done.out and "rim" not in done.out + done.err, done
     errors = json.loads(omnid("eval", found, recording / "truth.txt", "--json").out)

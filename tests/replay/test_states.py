@@ -113,7 +113,7 @@ def test_cameras_that_are_exchanged_on_the_way(omnid: Command, tmp_path: Path, s
     taken = [p if p.pair < 6 else replace(p, camera=other[p.camera]) for p in images(scene / "log.mcap")]
     log = save(tmp_path / "log.mcap", taken)
     result = omnid.replay(log, "--record", tmp_path / "out.mcap", rig=scene / "rig.toml")
-    assert "the images match better the other way round" in result.err
+    assert "is --lower the lower one" in result.err
     found = states(tmp_path / "out.mcap")
     assert found[0] == ("tracking", 0) and "lost" in dict(found)
     assert "tracking" not in dict(found[1:])

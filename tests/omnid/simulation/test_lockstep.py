@@ -182,8 +182,6 @@ def test_the_floor_that_was_driven_is_free_and_a_low_box_and_a_white_pole_beside
     assert (found.cells[driven] == FREE).mean() > 0.9
     assert in_box.sum() > 50 and (found.cells[in_box] == UNKNOWN).all()
     assert in_pole.any() and (found.cells[in_pole] == UNKNOWN).all()
-    # Views from which it is found, each by itself; in so short a drive its floor is also seen too seldom to be free.
-    assert sum((keyframe.free_m < 0).any() for keyframe in places.keyframes.values()) >= 2
 
 
 # `omnid simulate` in its own time: a daemon that is slowed down loses nothing, and drives where it is told to.
