@@ -60,8 +60,8 @@ class GridParameters:
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
     shown_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
-    shown_least: float = 0.08  # mean from which something hangs there,
-    shown_weight: float = 30.0  # and its log-odds by this mean
+    shown_least: float = 0.025  # mean from which something hangs there,
+    shown_weight: float = 100.0  # and its log-odds by this mean
 
 
 CELL_M: Final = kernels.CELL_M
