@@ -165,7 +165,6 @@ class OdometryConfig:
 
     method: Annotated[Literal["default", "paper"], "method of the odometry"] = "default"
     tracker: Annotated[Literal["improved", "klt"], "feature tracker of the paper's method"] = "improved"
-    reference: Annotated[Literal["previous", "keyframe"], "reference frame of the paper's method"] = "previous"
     noise_px: float = 0.1  # sigma of a tracked corner, px
     klt: KltSettings = field(default_factory=KltSettings)
     limits: OdometryLimits = field(default_factory=OdometryLimits)

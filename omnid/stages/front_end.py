@@ -67,7 +67,7 @@ class FrontEnd:
         else:
             from omnid.core.odometry.paper.paper_odometry import PaperOdometry
 
-            self._method = PaperOdometry(model, settings.klt, settings.tracker, settings.reference)
+            self._method = PaperOdometry(model, settings.klt, settings.tracker)
         self._agreement = MotionAgreement(self.motion)
         self.last_fault = AGREE  # the last disagreement that was more than a doubt
         self._contradiction = Contradiction()

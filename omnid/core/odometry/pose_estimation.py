@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,31 +60,40 @@ def ransac(
 ) -> tuple[Array, Flags]:
     """Return the motion T_curr_ref with the largest consensus set of landmarks (N, 3), and the set's flags (N,).
 
-    Three of the points seen in both cameras give a hypothesis; the errors of the views [px] give its consensus set:
-    Dang et al. 2012, section IV.B, with the distance measured in the images, where the noise is even. No motion is the
-    first hypothesis: nothing is drawn where nearly all agree with it, as where the landmarks are those of a good guess.
-    Others are drawn in batches until three inliers have almost certainly been among them.
+    The distance is measured in the views (N, 3) [px], where the noise is even; an unknown upper row counts as right.
     """
-    seen = triangulate(views, model.cylinder, model.baseline_m)
-    usable = np.flatnonzero(np.isfinite(seen).all(axis=1))
-    motions = np.eye(4)[None]
-    best, consensus = motions[0], np.zeros(len(landmarks), bool)
-    for drawn in range(0, RANSAC_MOST + 1, RANSAC_BATCH):
-        if drawn:
-            triples = usable[rng.random((RANSAC_BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
-            motions = rigid_fit(landmarks[triples], seen[triples])
+
+    def agree(motions: Array) -> Flags:
         moved = se3.apply(motions, landmarks)
         error = views - view(moved.reshape(-1, 3), model.cylinder, model.baseline_m).reshape(moved.shape)
         error[..., 0] = model.cylinder.wrap(error[..., 0])
-        # An unknown upper row is NaN, and not larger than the threshold.
-        agree = np.asarray(~(np.abs(error) >= threshold_px).any(axis=2))
-        most = int(agree.sum(axis=1).argmax())
-        if agree[most].sum() > consensus.sum():
-            best, consensus = motions[most], agree[most]
-        share = float(consensus.mean()) if len(consensus) else 0.0
+        return np.asarray(~(np.abs(error) >= threshold_px).any(axis=2))
+
+    return consensus(landmarks, triangulate(views, model.cylinder, model.baseline_m), agree, rng)
+
+
+def consensus(a: Array, b: Array, agree: Callable[[Array], Flags], rng: np.random.Generator) -> tuple[Array, Flags]:
+    """Return the motion T_b_a with the largest consensus set of points (N, 3), and the set's flags (N,).
+
+    Three pairs of points, of which b may be NaN where it is unknown, give a hypothesis: Dang et al. 2012, section IV.B.
+    agree: returns flags (K, N) of the points that agree with motions (K, 4, 4). No motion is the first hypothesis:
+    nothing is drawn where nearly all agree with it, as where the points are those of a good guess. Others are drawn in
+    batches until three inliers have almost certainly been among them.
+    """
+    usable, motions = np.flatnonzero(np.isfinite(b).all(axis=1)), np.eye(4)[None]
+    best, chosen = motions[0], np.zeros(len(a), bool)
+    for drawn in range(0, RANSAC_MOST + 1, RANSAC_BATCH):
+        if drawn:
+            triples = usable[rng.random((RANSAC_BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
+            motions = rigid_fit(a[triples], b[triples])
+        agreeing = agree(motions)
+        most = int(agreeing.sum(axis=1).argmax())
+        if agreeing[most].sum() > chosen.sum():
+            best, chosen = motions[most], agreeing[most]
+        share = float(chosen.mean()) if len(chosen) else 0.0
         if len(usable) < 3 or (share > GOOD_GUESS if not drawn else (1 - share**3) ** drawn < RANSAC_MISSED):
             break
-    return best, consensus
+    return best, chosen
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,8 +42,6 @@ def track(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt
     Returns the pixels (N, 2) in b and flags (N,) of those that the track back leads to where they started. Columns are
     returned in [0, width). The status of Lucas-Kanade is no evidence: it only states that the iteration ended.
     """
-    if not len(points):
-        return points.copy(), np.zeros(0, bool)
     there, found = flow(a, b, points, guess, klt)
     back, returned = flow(b, a, there, points, klt)
     error = back - points
@@ -57,6 +55,8 @@ def flow(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt:
 
     Returns the pixels (N, 2) in b and flags (N,) of those that ended inside the image.
     """
+    if not len(points):  # OpenCV refuses them
+        return points.copy(), np.zeros(0, bool)
     start, target = (np.ascontiguousarray(padded(*at)[:, None], np.float32) for at in ((a, points), (b, guess)))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, CONVERGED_PX)
     there, status, _ = cv2.calcOpticalFlowPyrLK(

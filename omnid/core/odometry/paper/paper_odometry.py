@@ -1,7 +1,8 @@
 """Ego-motion of Dang et al. 2012, section IV and figure 5, as published: frame to frame, 3-D to 3-D.
 
-Kept for comparison with the default method. Its known weaknesses: eq. (9) weights far points as much as near ones,
-depth noise enters both of its sides, and an error between two frames is never corrected later.
+It is selected by `--method paper`, so that the paper's experiments can be made again (`python -m tests.bench.paper`),
+and a measure for the default method. Its known weaknesses: eq. (9) weights far points as much as near ones, depth noise
+enters both of its sides, and an error between two frames is never corrected later.
 """
 
 from __future__ import annotations
@@ -17,24 +18,20 @@ from calib import se3
 from omnid.core.odometry.corners import corners, nearby_disparity
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
-from omnid.core.odometry.paper.registration import Registration, consensus, register
+from omnid.core.odometry.pose_estimation import consensus, rigid_fit
 from omnid.core.odometry.pose_search import MIN_LANDMARKS
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings, flow, steps, track
 from omnid.core.stereo.triangulation import triangulate, view
 from omnid.core.types.stereo_model import StereoModel
-from omnid.errors import OmnidError
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-TRACKERS = ("improved", "klt")
-REFERENCES = ("previous", "keyframe")
 FEATURES = OdometryLimits().features  # so that the methods are compared with as many
 # Share of the features that makes a yaw hypothesis good enough ("N is more than needed", section IV.F). Beyond the
-# ample share the search ends; between the two the next larger turn is tried as long as it finds more. A keyframe with
-# less than it of its largest consensus set is replaced.
+# ample share the search ends; between the two the next larger turn is tried as long as it finds more.
 ENOUGH_RATIO = 0.5
 AMPLE_RATIO = 0.85
 THRESHOLD_M = 0.05  # largest 3-D error of a point of the consensus set, as in section IV.B
@@ -44,34 +41,22 @@ JERK_PSD = (10.0, 4000.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
-    """The frame that motions are measured against, with its pose and the pose's covariance."""
+class Registration:
+    """Motion M (4, 4) of the points, b = M a, and its covariance (6, 6) [t; r] on the left of M."""
 
-    frame: StereoFrame
-    T_odom_rect: Array
+    M: Array
     covariance: Array
 
 
 class PaperOdometry:
-    """Estimate the pose of the rectified frame from pair to pair; odom is the rectified frame of the first pair.
+    """Estimate the pose of the rectified frame from pair to pair; odom is the rectified frame of the first pair."""
 
-    tracker: 'improved' rotates the image until enough features are tracked (section IV.F), 'klt' does not. reference:
-    'previous' measures against the previous frame, as the paper does; 'keyframe' against a frame that is kept while
-    half of its points are inliers, which shows the effect of keyframes alone.
-    """
-
-    def __init__(
-        self, model: StereoModel, klt: KltSettings, tracker: str = "improved", reference: str = "previous"
-    ) -> None:
-        for name, found, known in (("tracker", tracker, TRACKERS), ("reference", reference, REFERENCES)):
-            if found not in known:
-                raise OmnidError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
+    def __init__(self, model: StereoModel, klt: KltSettings, tracker: str = "improved") -> None:
+        """tracker: 'improved' rotates the image until enough features are tracked (section IV.F), 'klt' does not."""
         self._model, self._klt, self._tracker = model, klt, tracker
-        self._keeps_reference = reference == "keyframe"
         self._filter = MotionFilter(JERK_PSD)
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
-        self._reference: Reference | None = None
-        self._most_inliers = 0
+        self._previous: StereoFrame | None = None
         self._untracked_s = 0.0  # time since the last tracked pose
         self._resets = 0  # gaps after which tracking went on
 
@@ -80,70 +65,49 @@ class PaperOdometry:
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first): the steps of figure 5."""
-        reference = self._reference
-        if reference is None:
-            self._set_reference(frame)
+        previous, self._previous = self._previous, frame
+        if previous is None:
             return self._result(TrackingState.TRACKING, 0, 0)
 
         # 1. Detect features, track them into the current frame and locate them in both frames (section IV.A).
-        F_a = corners(reference.frame.lower, reference.frame.usable, FEATURES)
-        F_b, tracked = self._track(reference.frame, frame, F_a)
-        X_a = locate(reference.frame, F_a[tracked], self._model)
-        X_b = locate(frame, F_b[tracked], self._model)
+        F_a = corners(previous.lower, previous.usable, FEATURES)
+        if self._tracker == "improved":
+            F_b, tracked = turned_track(previous, frame, F_a, self._klt)
+        else:
+            F_b, tracked = flow(previous.lower, frame.lower, F_a, F_a, self._klt)
+        X_a, X_b = locate(previous, F_a[tracked], self._model), locate(frame, F_b[tracked], self._model)
         located = np.isfinite(X_a).all(axis=1) & np.isfinite(X_b).all(axis=1)
         X_a, X_b = X_a[located], X_b[located]
 
         # 2. Eliminate outliers by RANSAC on three points (section IV.B).
-        M, is_inlier = consensus(X_a, X_b, np.random.default_rng(frame.seq), THRESHOLD_M)
+        def agree(motions: Array) -> Flags:
+            return np.asarray(np.linalg.norm(se3.apply(motions, X_a) - X_b, axis=-1) < THRESHOLD_M)
+
+        _, is_inlier = consensus(X_a, X_b, agree, np.random.default_rng(frame.seq))
         inliers = int(is_inlier.sum())
         if inliers < MIN_LANDMARKS:
-            return self._refuse(frame, dt_s, len(X_a), inliers)
+            return self._refuse(dt_s, len(X_a), inliers)
 
-        # 3. Estimate the motion of the points by Gauss-Newton (section IV.C, eq. 9).
-        motion = register(X_a[is_inlier], X_b[is_inlier], M)
+        # 3. Estimate the motion of the points (section IV.C, eq. 9), and refine it by KLT, started where it predicts
+        #    the features.
+        motion = register(X_a[is_inlier], X_b[is_inlier])
+        motion = refine(previous, frame, F_a, motion, self._model, self._klt)
 
-        # 4. Refine the result by KLT, started where the estimated motion predicts the features.
-        motion = refine(reference.frame, frame, F_a, motion, self._model, self._klt)
-
-        # 5. Filter the motion (section IV.D) and compose its inverse, the motion of the camera (eq. 12).
-        self._move(reference, motion, dt_s)
-        self._most_inliers = max(self._most_inliers, inliers)
-        if not self._keeps_reference or inliers < ENOUGH_RATIO * self._most_inliers:
-            self._set_reference(frame)
+        # 4. Filter the motion (section IV.D) and compose its inverse, the motion of the camera (eq. 12). The
+        #    measurement is the twist where eq. (11) has Euler angles: both agree for small motions, and for large ones
+        #    only the twist is proportional to time.
+        T_prev_curr, A = se3.inverse(motion.M), se3.adjoint(motion.M)
+        self._covariance = A @ self._covariance @ A.T + motion.covariance
+        if dt_s > 0:
+            self._filter.predict(dt_s)
+            T_prev_curr = self._filter.update(T_prev_curr, motion.covariance, dt_s)
+        self._T_odom_rect = self._T_odom_rect @ T_prev_curr
         # The motion in a gap is not known: odom goes on from another place.
         state = TrackingState.DEGRADED if self._untracked_s else TrackingState.TRACKING
         self._resets, self._untracked_s = self._resets + bool(self._untracked_s), 0.0
         return self._result(state, len(X_a), inliers)
 
-    def _set_reference(self, frame: StereoFrame) -> None:
-        """Measure the following motions against a frame whose pose is the current one."""
-        self._reference = Reference(frame, self._T_odom_rect, self._covariance)
-        self._most_inliers = 0
-
-    def _track(self, previous: StereoFrame, frame: StereoFrame, features: Array) -> tuple[Array, Flags]:
-        """Return the pixels (N, 2) of features in a frame, and flags (N,) of those that were found."""
-        if not len(features):
-            return features, np.zeros(0, bool)
-        if self._tracker == "klt":
-            return flow(previous.lower, frame.lower, features, features, self._klt)
-        return turned_track(previous, frame, features, self._klt)
-
-    def _move(self, reference: Reference, motion: Registration, dt_s: float) -> None:
-        """Filter the motion of the points and compose its inverse to the current pose.
-
-        The measurement noise of the filter is the covariance of the registration. The measurement is the twist where
-        eq. (11) has Euler angles: both agree for small motions, and for large ones only the twist is proportional to
-        time.
-        """
-        T_ref_curr = se3.inverse(motion.M)
-        T_prev_curr = se3.inverse(self._T_odom_rect) @ reference.T_odom_rect @ T_ref_curr
-        if dt_s > 0:
-            self._filter.predict(dt_s)
-            T_prev_curr = self._filter.update(T_prev_curr, motion.covariance, dt_s)
-        self._T_odom_rect = self._T_odom_rect @ T_prev_curr
-        self._covariance = _moved_covariance(reference.covariance, T_ref_curr) + motion.covariance
-
-    def _refuse(self, frame: StereoFrame, dt_s: float, tracked: int, inliers: int) -> OdometryEstimate:
+    def _refuse(self, dt_s: float, tracked: int, inliers: int) -> OdometryEstimate:
         """Keep the pose: the paper does not treat this case.
 
         Its covariance grows as under an unknown steady velocity.
@@ -152,7 +116,6 @@ class PaperOdometry:
         before_s, self._untracked_s = self._untracked_s, self._untracked_s + dt_s
         growth = UNKNOWN_SPEED_SIGMA**2 * (self._untracked_s**2 - before_s**2)
         self._covariance = bounded(self._covariance + growth * np.eye(6))
-        self._set_reference(frame)
         return self._result(TrackingState.LOST, tracked, inliers)
 
     def _result(self, state: TrackingState, tracked: int, inliers: int) -> OdometryEstimate:
@@ -168,12 +131,6 @@ class PaperOdometry:
         )
 
 
-def _moved_covariance(covariance: Array, T_a_b: Array) -> Array:
-    """Return the covariance (6, 6) of a pose, given in its own axes a, in axes b that are rigidly joined to it."""
-    A = se3.adjoint(se3.inverse(T_a_b))
-    return np.asarray(A @ covariance @ A.T)
-
-
 def locate(frame: StereoFrame, features: Array, model: StereoModel) -> Array:
     """Return 3-D points (N, 3) in the rectified frame of features (N, 2), by the located point next to each: eq. (8).
 
@@ -182,6 +139,21 @@ def locate(frame: StereoFrame, features: Array, model: StereoModel) -> Array:
     disparity = nearby_disparity(frame.disparity, features)
     views = np.column_stack([features, features[:, 1] + disparity])
     return triangulate(views, model.cylinder, model.baseline_m)
+
+
+def register(a: Array, b: Array) -> Registration:
+    """Return the motion that minimises sum |b - M a|^2 over points (N, 3), N > 2: eq. (9).
+
+    The paper finds the minimum by Gauss-Newton, here it has a closed form. The covariance is estimated from the
+    residuals (White 1980), so it includes that far points are noisier, which eq. (9) ignores; it excludes the bias.
+    """
+    M = rigid_fit(a, b)
+    moved = se3.apply(M, a)
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(b), 3, 3)), -se3.hat(moved)], axis=2)
+    slopes = (np.swapaxes(J, 1, 2) @ (b - moved)[:, :, None])[:, :, 0]
+    H = np.linalg.pinv(np.einsum("nij,nik->jk", J, J))
+    freedom = len(b) / max(1, len(b) - 2)  # six unknowns use up the errors of two points
+    return Registration(M, freedom * H @ (slopes.T @ slopes) @ H)
 
 
 def refine(
@@ -208,7 +180,7 @@ def refine(
     is_inlier = error_m < THRESHOLD_M  # false for NaN
     if is_inlier.sum() < MIN_LANDMARKS:
         return motion
-    return register(X_a[is_inlier], X_b[is_inlier], motion.M)
+    return register(X_a[is_inlier], X_b[is_inlier])
 
 
 def turned_track(
