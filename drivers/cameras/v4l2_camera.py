@@ -12,16 +12,15 @@ from contextlib import suppress
 from typing import Final
 
 from drivers.backoff import Backoff
-from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.camera_state import CameraExposure, CameraState
 from drivers.cameras.v4l2_controls import V4l2Settings, exposure_in_force, exposure_ranges, follow_request
 from drivers.cameras.v4l2_device import V4l2Stream, device_error
+from drivers.cameras.v4l2_ioctl import BufferFlag, Int32, V4l2Buffer
 from drivers.errors import DriverError, EventCallback, ignore_event
 from drivers.frame import Camera, Frame
 
 POLL_S: Final = 0.1  # longest wait until `close` is noticed
 _PAUSE_S: Final = 0.005  # Pause where poll() reports a device as ready and no buffer is filled.
-_MAX_AGE_NS: Final = 10 * 10**9  # no driver keeps a buffer for longer; an older stamp is from another clock
 
 
 class V4l2Camera:
@@ -41,7 +40,7 @@ class V4l2Camera:
             self.state.exposure = CameraExposure(ranges, in_force=exposure_in_force(fd, ranges))
         self._settings, self._camera, self._on_event = settings, camera, on_event
         self._name = f"{camera} camera"
-        self._checks = BufferChecks(self._name, self.state, on_event)
+        self._checks = BufferChecks(self._name, self.state, settings.timeout_s, on_event)
         self._closing, self._reading = threading.Event(), False
 
     def frames(self) -> Iterator[Frame]:
@@ -149,41 +148,43 @@ class BufferChecks:
     Each kind of fault of the stamps is reported once by `on_event`, with `name` in front.
     """
 
-    def __init__(self, name: str, state: CameraState, on_event: EventCallback) -> None:
+    def __init__(self, name: str, state: CameraState, timeout_s: float, on_event: EventCallback) -> None:
+        """timeout_s: no driver keeps a buffer for longer; an older stamp is from another clock."""
         self._name, self._state, self._on_event = name, state, on_event
+        self._max_age_ns = round(timeout_s * 1e9)
         self.last_sequence: int | None = None  # None: the first buffer of a stream is awaited
         self._last_ns = -1
         self._least_delay_ns: int | None = None  # from valid stamps to their arrivals
         self._reported: set[str] = set()
 
-    def accept(self, buffer: v4l2.V4l2Buffer, min_bytes: int) -> bool:
+    def accept(self, buffer: V4l2Buffer, min_bytes: int) -> bool:
         """Count a buffer, and those missing since the last one; True if it holds an image.
 
         min_bytes: size of the smallest complete image. A shorter buffer, or one with the driver's error flag, is
         counted as an error; a step of the sequence backwards counts as its restart.
         """
         if self.last_sequence is not None:
-            step = v4l2.Int32(buffer.sequence - self.last_sequence).value  # the counter has 32 bits, too
+            step = Int32(buffer.sequence - self.last_sequence).value  # the counter has 32 bits, too
             if step > 0:
                 self._state.drops += step - 1
             else:
                 self._state.restarts += 1
         self.last_sequence = buffer.sequence
-        is_broken = bool(buffer.flags & v4l2.BUFFER_ERROR) or buffer.bytesused < min_bytes
+        is_broken = bool(buffer.flags & BufferFlag.ERROR) or buffer.bytesused < min_bytes
         self._state.errors += is_broken
         return not is_broken
 
-    def stamp_ns(self, buffer: v4l2.V4l2Buffer, arrival_ns: int) -> int:
+    def stamp_ns(self, buffer: V4l2Buffer, arrival_ns: int) -> int:
         """Return the capture time of a buffer [ns of CLOCK_MONOTONIC], strictly increasing from call to call.
 
         arrival_ns: time at which the buffer was taken from the driver, same clock. A stamp is valid if it is later
-        than the one before and at most 10 s before the arrival; others are replaced by the arrival less the least
+        than the one before and at most timeout_s before the arrival; others are replaced by the arrival less the least
         delay. v4l2loopback does not declare its clock: its stamps are taken for CLOCK_MONOTONIC, with one warning.
         """
-        if buffer.flags & v4l2.TIMESTAMP_MASK != v4l2.TIMESTAMP_MONOTONIC:
+        if buffer.flags & BufferFlag.TIMESTAMP_MASK != BufferFlag.TIMESTAMP_MONOTONIC:
             self._report_once("its driver does not declare a clock for its stamps; CLOCK_MONOTONIC is assumed")
         stamp_ns, delay_ns = buffer.stamp_ns, arrival_ns - buffer.stamp_ns
-        if max(self._last_ns, arrival_ns - _MAX_AGE_NS) < stamp_ns <= arrival_ns:
+        if max(self._last_ns, arrival_ns - self._max_age_ns) < stamp_ns <= arrival_ns:
             self._least_delay_ns = delay_ns if self._least_delay_ns is None else min(self._least_delay_ns, delay_ns)
         else:
             self._state.restamped += 1

@@ -15,18 +15,10 @@ from drivers.cameras.camera_state import (
     ExposureSetting,
     ValueRange,
 )
+from drivers.cameras.v4l2_ioctl import ControlId, ExposureMode
 from drivers.errors import DriverError
 
-# linux/v4l2-controls.h: V4L2_CID_*
-GAIN: Final = 0x00980913
-AUTO_GAIN: Final = 0x00980912
-POWER_LINE_FREQUENCY: Final = 0x00980918
-AUTO_EXPOSURE: Final = 0x009A0901
-EXPOSURE: Final = 0x009A0902
-EXPOSURE_MAY_SLOW: Final = 0x009A0903  # V4L2_CID_EXPOSURE_AUTO_PRIORITY: automatic exposure may lower the rate
 EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
-# enum v4l2_exposure_auto_type; USB cameras offer APERTURE_PRIORITY in place of AUTOMATIC.
-AUTOMATIC, MANUAL_EXPOSURE, APERTURE_PRIORITY = 0, 1, 3
 _POWER_LINE: Final = ("off", "50", "60", "auto")  # enum v4l2_power_line_frequency
 _LOST: Final = (errno.ENODEV, errno.EBUSY)  # the camera is opened again, with its settings and its request
 
@@ -66,15 +58,15 @@ def list_controls(fd: int) -> dict[int, CameraControl]:
     found, last = dict[int, CameraControl](), 0
     while True:
         # The driver returns the control after `last`, and an error after the last one; a faulty one may go in circles.
-        entry = v4l2.QueryControl(id=last | v4l2.NEXT_CONTROL)
+        entry = v4l2.QueryControl(id=last | v4l2.ControlFlag.NEXT_CTRL)
         try:
-            v4l2.call(fd, v4l2.QUERYCTRL, entry)
+            v4l2.call(fd, "QUERYCTRL", entry)
         except OSError:
             return found
         if entry.id <= last:
             return found
         last = entry.id
-        if not entry.flags & v4l2.CONTROL_UNUSABLE:
+        if not entry.flags & (v4l2.ControlFlag.DISABLED | v4l2.ControlFlag.READ_ONLY):
             # As v4l2-ctl writes it: exposure_time_absolute for 'Exposure Time, Absolute'.
             name = re.sub(r"[^a-z0-9]+", "_", entry.name.decode("utf-8", "replace").lower()).strip("_")
             found[last] = CameraControl(last, name, ValueRange(entry.minimum, entry.maximum, max(1, entry.step)))
@@ -90,20 +82,20 @@ def set_controls(fd: int, settings: V4l2Settings) -> None:
     # 1. The wanted values: the setting, the control, the value and what may stand for it.
     wanted: list[tuple[str, int, tuple[int, ...]]] = []
     is_manual = settings.exposure_us > 0 or settings.auto_exposure == "off"
-    if is_manual or settings.auto_exposure == "on" or (settings.is_regulated and AUTO_EXPOSURE in offered):
+    if is_manual or settings.auto_exposure == "on" or (settings.is_regulated and ControlId.AUTO_EXPOSURE in offered):
         # An exposure that a run regulates is automatic until the run sends its first value.
-        modes = (MANUAL_EXPOSURE,) if is_manual else (AUTOMATIC, APERTURE_PRIORITY)
-        wanted.append(("auto_exposure", AUTO_EXPOSURE, modes))
+        modes = (ExposureMode.MANUAL,) if is_manual else (ExposureMode.AUTO, ExposureMode.APERTURE_PRIORITY)
+        wanted.append(("auto_exposure", ControlId.AUTO_EXPOSURE, modes))
     if settings.auto_exposure != "keep" or is_manual:
-        wanted += [("", EXPOSURE_MAY_SLOW, (0,))] if EXPOSURE_MAY_SLOW in offered else []
+        wanted += [("", ControlId.EXPOSURE_AUTO_PRIORITY, (0,))] if ControlId.EXPOSURE_AUTO_PRIORITY in offered else []
     if is_manual and settings.exposure_us:
-        wanted.append(("exposure_us", EXPOSURE, (round(settings.exposure_us / EXPOSURE_UNIT_US),)))
-    if (settings.gain >= 0 or settings.is_regulated) and AUTO_GAIN in offered:
-        wanted.append(("", AUTO_GAIN, (int(settings.gain < 0),)))
+        wanted.append(("exposure_us", ControlId.EXPOSURE, (round(settings.exposure_us / EXPOSURE_UNIT_US),)))
+    if (settings.gain >= 0 or settings.is_regulated) and ControlId.AUTO_GAIN in offered:
+        wanted.append(("", ControlId.AUTO_GAIN, (int(settings.gain < 0),)))
     if settings.gain >= 0:
-        wanted.append(("gain", GAIN, (settings.gain,)))
+        wanted.append(("gain", ControlId.GAIN, (settings.gain,)))
     if settings.power_line != "keep":
-        wanted.append(("power_line", POWER_LINE_FREQUENCY, (_POWER_LINE.index(settings.power_line),)))
+        wanted.append(("power_line", ControlId.POWER_LINE_FREQUENCY, (_POWER_LINE.index(settings.power_line),)))
     # 2. Others by their names.
     ids = {control.name: control.id for control in offered.values()}
     for text in settings.controls:
@@ -139,12 +131,12 @@ def _refusal(fd: int, control: CameraControl, value: int) -> str:
 
 def _read(fd: int, control_id: int) -> int:
     control = v4l2.V4l2Control(control_id)
-    v4l2.call(fd, v4l2.G_CTRL, control)
+    v4l2.call(fd, "G_CTRL", control)
     return int(control.value)
 
 
 def _write(fd: int, control_id: int, value: int) -> None:
-    v4l2.call(fd, v4l2.S_CTRL, v4l2.V4l2Control(control_id, value))
+    v4l2.call(fd, "S_CTRL", v4l2.V4l2Control(control_id, value))
 
 
 def exposure_ranges(fd: int, settings: V4l2Settings) -> ExposureRanges | None:
@@ -153,19 +145,19 @@ def exposure_ranges(fd: int, settings: V4l2Settings) -> ExposureRanges | None:
     A gain that the settings fix is not set.
     """
     offered = list_controls(fd)
-    if EXPOSURE not in offered:
+    if ControlId.EXPOSURE not in offered:
         return None
-    times = offered[EXPOSURE].range
+    times = offered[ControlId.EXPOSURE].range
     low, high, step = (value * EXPOSURE_UNIT_US for value in (times.low, times.high, times.step))
-    gain = offered[GAIN].range if GAIN in offered and settings.gain < 0 else None
+    gain = offered[ControlId.GAIN].range if ControlId.GAIN in offered and settings.gain < 0 else None
     return ExposureRanges(ValueRange(low, high, step), gain)
 
 
 def exposure_in_force(fd: int, ranges: ExposureRanges) -> ExposureSetting | None:
     """Return exposure time and gain as the device reports them; None where it does not."""
     with suppress(OSError):
-        gain = None if ranges.gain is None else _read(fd, GAIN)
-        return ExposureSetting(_read(fd, EXPOSURE) * EXPOSURE_UNIT_US, gain)
+        gain = None if ranges.gain is None else _read(fd, ControlId.GAIN)
+        return ExposureSetting(_read(fd, ControlId.EXPOSURE) * EXPOSURE_UNIT_US, gain)
     return None
 
 
@@ -196,9 +188,9 @@ def follow_request(fd: int, settings: V4l2Settings, exposure: CameraExposure, st
 def _set_exposure(fd: int, setting: ExposureSetting) -> None:
     """Switch the automatic modes off, where the device has them, and set the values."""
     offered = list_controls(fd)
-    values = [(AUTO_EXPOSURE, MANUAL_EXPOSURE)] if AUTO_EXPOSURE in offered else []
-    values += [(AUTO_GAIN, 0)] if AUTO_GAIN in offered and setting.gain is not None else []
-    values.append((EXPOSURE, round(setting.exposure_us / EXPOSURE_UNIT_US)))
-    values += [(GAIN, setting.gain)] if setting.gain is not None else []
+    values = [(ControlId.AUTO_EXPOSURE, ExposureMode.MANUAL)] if ControlId.AUTO_EXPOSURE in offered else []
+    values += [(ControlId.AUTO_GAIN, 0)] if ControlId.AUTO_GAIN in offered and setting.gain is not None else []
+    values.append((ControlId.EXPOSURE, round(setting.exposure_us / EXPOSURE_UNIT_US)))
+    values += [(ControlId.GAIN, setting.gain)] if setting.gain is not None else []
     for control_id, value in values:
         _write(fd, control_id, value)

@@ -20,9 +20,6 @@ from drivers.errors import DriverError
 RULES_FILE: Final = "/etc/udev/rules.d/70-omnid-cameras.rules"  # ID_PATH is set by 60-persistent-v4l.rules
 # V4L2's fourcc -> the name in a Frame, in the order of preference: no decoding first, then fewer bytes
 ENCODINGS: Final = {"GREY": "mono8", "NV12": "nv12", "YUYV": "yuyv", "UYVY": "uyvy", "MJPG": "jpeg", "JPEG": "jpeg"}
-_MEMORY_TO_MEMORY: Final = 0x8000 | 0x4000  # V4L2_CAP_VIDEO_M2M and V4L2_CAP_VIDEO_M2M_MPLANE: codecs
-_BYTES_PER_PIXEL: Final = {"GREY": 1, "NV12": 1, "YUYV": 2, "UYVY": 2}  # of the first plane; others are compressed
-_RATE_TOLERANCE: Final = 0.02  # relative; 29.97 Hz passes for 30 Hz
 _BUFFERS: Final = 4  # v4l2loopback needs exactly this number
 _ADVICE: Final = {
     errno.ENOENT: "is not there; check the cable and the name, `omnid cameras` lists the cameras",
@@ -82,15 +79,15 @@ class V4l2Stream:
         self._resources = ExitStack()
         try:
             self.fd = self._resources.enter_context(_opened(settings.device))
-            needed = v4l2.CAP_VIDEO_CAPTURE | v4l2.CAP_STREAMING
+            needed = v4l2.Capability.VIDEO_CAPTURE | v4l2.Capability.STREAMING
             if _capabilities(self.fd) & needed != needed:  # a loopback device captures while a program writes to it
                 raise DriverError("is no capture device now; `omnid cameras` lists those that are")
             self.image = _set_image(self.fd, settings)
             self._maps = self._mapped_buffers()
             set_controls(self.fd, settings)
             for index in range(len(self._maps)):
-                v4l2.call(self.fd, v4l2.QBUF, v4l2.V4l2Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP))
-            v4l2.call(self.fd, v4l2.STREAMON, v4l2.Int32(v4l2.CAPTURE))  # closing the device ends the stream
+                v4l2.call(self.fd, "QBUF", v4l2.V4l2Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP))
+            v4l2.call(self.fd, "STREAMON", v4l2.Int32(v4l2.CAPTURE))  # closing the device ends the stream
         except BaseException as error:
             self._resources.close()
             if isinstance(error, OSError):
@@ -106,12 +103,12 @@ class V4l2Stream:
         """
         buffer = v4l2.V4l2Buffer(type=v4l2.CAPTURE, memory=v4l2.MMAP)
         try:
-            v4l2.call(self.fd, v4l2.DQBUF, buffer)
+            v4l2.call(self.fd, "DQBUF", buffer)
         except BlockingIOError:
             return None
         data = self._maps[buffer.index][: buffer.bytesused]
         filled = v4l2.V4l2Buffer.from_buffer_copy(buffer)  # QBUF overwrites the structure
-        v4l2.call(self.fd, v4l2.QBUF, buffer)
+        v4l2.call(self.fd, "QBUF", buffer)
         return filled, data
 
     def close(self) -> None:
@@ -121,13 +118,13 @@ class V4l2Stream:
     def _mapped_buffers(self) -> list[mmap.mmap]:
         """Allocate buffers; from now on other programs get EBUSY. DriverError where there are fewer than 2."""
         request = v4l2.BufferRequest(count=_BUFFERS, type=v4l2.CAPTURE, memory=v4l2.MMAP)
-        v4l2.call(self.fd, v4l2.REQBUFS, request)
+        v4l2.call(self.fd, "REQBUFS", request)
         if request.count < 2:  # one to fill while the other is read
             raise DriverError(f"the device gave {request.count} buffers; streaming needs 2")
         maps = list[mmap.mmap]()
         for index in range(request.count):
             buffer = v4l2.V4l2Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP)
-            v4l2.call(self.fd, v4l2.QUERYBUF, buffer)
+            v4l2.call(self.fd, "QUERYBUF", buffer)
             offset = buffer.m.offset
             maps.append(mmap.mmap(self.fd, buffer.length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset))
             self._resources.callback(maps[-1].close)
@@ -136,9 +133,9 @@ class V4l2Stream:
 
 def _capabilities(fd: int) -> int:
     """Return the capabilities of this node of the device (`device_caps`)."""
-    found = v4l2.Capability()
-    v4l2.call(fd, v4l2.QUERYCAP, found)
-    return int(found.device_caps if found.capabilities & v4l2.CAP_DEVICE_CAPS else found.capabilities)
+    found = v4l2.DeviceCapability()
+    v4l2.call(fd, "QUERYCAP", found)
+    return int(found.device_caps)
 
 
 def _set_image(fd: int, settings: V4l2Settings) -> StreamFormat:
@@ -157,7 +154,7 @@ def _set_image(fd: int, settings: V4l2Settings) -> StreamFormat:
             refused = error
             continue
         has_size = (found.width_px, found.height_px) == (settings.width_px, settings.height_px)
-        has_rate = abs(found.rate_hz - settings.rate_hz) <= _RATE_TOLERANCE * settings.rate_hz or not settings.rate_hz
+        has_rate = abs(found.rate_hz - settings.rate_hz) < 0.5 or not settings.rate_hz  # 29.97 Hz passes for 30 Hz
         if found.pixel_format == name and has_size and has_rate:
             return found
         instead.append(str(found))
@@ -177,23 +174,23 @@ def _image_in_force(fd: int, settings: V4l2Settings, pixel_format: str) -> Strea
     pix = image.fmt.pix
     pix.width, pix.height = settings.width_px, settings.height_px
     pix.pixelformat, pix.field = v4l2.fourcc_code(pixel_format), v4l2.PROGRESSIVE
-    v4l2.call(fd, v4l2.S_FMT, image)
+    v4l2.call(fd, "S_FMT", image)
     # 2. The rate.
     if settings.rate_hz:
         rate = v4l2.StreamParameters(type=v4l2.CAPTURE)
         wanted = Fraction(settings.rate_hz).limit_denominator(1000)
         rate.timeperframe = v4l2.Fraction(wanted.denominator, wanted.numerator)
         with suppress(OSError):  # the rate in force is read next
-            v4l2.call(fd, v4l2.S_PARM, rate)
+            v4l2.call(fd, "S_PARM", rate)
     # 3. What is in force.
     found, rate_hz = v4l2.StreamParameters(type=v4l2.CAPTURE), 0.0
     with suppress(OSError):  # a device need not state it
-        v4l2.call(fd, v4l2.G_PARM, found)
+        v4l2.call(fd, "G_PARM", found)
         interval = found.timeperframe
         rate_hz = interval.denominator / interval.numerator if interval.numerator else 0.0
     name = v4l2.fourcc(pix.pixelformat)
-    row_bytes = _BYTES_PER_PIXEL.get(name, 0) * pix.width
-    return StreamFormat(name, pix.width, pix.height, max(row_bytes, pix.bytesperline) if row_bytes else 0, rate_hz)
+    step = 0 if ENCODINGS.get(name) == "jpeg" else pix.bytesperline
+    return StreamFormat(name, pix.width, pix.height, step, rate_hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +230,7 @@ def _device(root: Path, entry: Path) -> CaptureDevice | None:
     node, problem = root / "dev" / entry.name, ""
     try:
         with _opened(node) as fd:
-            offered = _capabilities(fd)
-            if not offered & v4l2.CAP_VIDEO_CAPTURE or offered & _MEMORY_TO_MEMORY:
+            if not _capabilities(fd) & v4l2.Capability.VIDEO_CAPTURE:
                 return None
     except OSError as error:
         problem = str(device_error(str(node), error))

@@ -9,22 +9,54 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
+from enum import IntEnum, IntFlag
 from typing import Any, ClassVar, Final, TypeAlias
 
-CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
-MMAP: Final = 1  # V4L2_MEMORY_MMAP
-PROGRESSIVE: Final = 1  # V4L2_FIELD_NONE
+# V4L2_BUF_TYPE_VIDEO_CAPTURE, V4L2_MEMORY_MMAP, V4L2_FIELD_NONE
+CAPTURE = MMAP = PROGRESSIVE = 1
 
-CAP_VIDEO_CAPTURE: Final = 0x00000001
-CAP_STREAMING: Final = 0x04000000
-CAP_DEVICE_CAPS: Final = 0x80000000
 
-BUFFER_ERROR: Final = 0x40  # V4L2_BUF_FLAG_ERROR
-TIMESTAMP_MASK: Final = 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_MASK
-TIMESTAMP_MONOTONIC: Final = 0x2000  # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC
+class Capability(IntFlag):
+    """V4L2_CAP_*."""
 
-NEXT_CONTROL: Final = 0x80000000  # V4L2_CTRL_FLAG_NEXT_CTRL
-CONTROL_UNUSABLE: Final = 0x01 | 0x04  # V4L2_CTRL_FLAG_DISABLED, V4L2_CTRL_FLAG_READ_ONLY
+    VIDEO_CAPTURE = 0x00000001
+    STREAMING = 0x04000000
+
+
+class BufferFlag(IntFlag):
+    """V4L2_BUF_FLAG_*."""
+
+    ERROR = 0x40
+    TIMESTAMP_MASK = 0xE000
+    TIMESTAMP_MONOTONIC = 0x2000
+
+
+class ControlFlag(IntFlag):
+    """V4L2_CTRL_FLAG_*."""
+
+    DISABLED = 0x01
+    READ_ONLY = 0x04
+    NEXT_CTRL = 0x80000000
+
+
+class ControlId(IntEnum):
+    """V4L2_CID_* of linux/v4l2-controls.h."""
+
+    AUTO_GAIN = 0x00980912
+    GAIN = 0x00980913
+    POWER_LINE_FREQUENCY = 0x00980918
+    AUTO_EXPOSURE = 0x009A0901
+    EXPOSURE = 0x009A0902
+    EXPOSURE_AUTO_PRIORITY = 0x009A0903  # automatic exposure may lower the rate
+
+
+class ExposureMode(IntEnum):
+    """enum v4l2_exposure_auto_type; USB cameras offer APERTURE_PRIORITY in place of AUTO."""
+
+    AUTO = 0
+    MANUAL = 1
+    APERTURE_PRIORITY = 3
+
 
 Int32 = ctypes.c_int32
 _u32 = ctypes.c_uint32
@@ -36,7 +68,7 @@ def _words(names: str, kind: type[Any] = _u32) -> _Fields:
     return [(name, kind) for name in names.split()]
 
 
-class Capability(ctypes.Structure):
+class DeviceCapability(ctypes.Structure):
     """struct v4l2_capability."""
 
     _names: ClassVar[_Fields] = [("driver", ctypes.c_char * 16), ("card", ctypes.c_char * 32)]
@@ -116,31 +148,23 @@ class V4l2Control(ctypes.Structure):
     _fields_ = (("id", _u32), ("value", Int32))
 
 
-_WRITE, _READ = 1, 2  # _IOC_WRITE, _IOC_READ
+# Number of a request, and its direction: the bits of _IOC_WRITE (1) and _IOC_READ (2).
+_REQUESTS: Final = {
+    "QUERYCAP": (0, 2), "S_FMT": (5, 3), "REQBUFS": (8, 3), "QUERYBUF": (9, 3), "QBUF": (15, 3), "DQBUF": (17, 3),
+    "STREAMON": (18, 1), "G_PARM": (21, 3), "S_PARM": (22, 3), "G_CTRL": (27, 3), "S_CTRL": (28, 3),
+    "QUERYCTRL": (36, 3),
+}  # fmt: skip
 
 
-def _request(direction: int, number: int, argument: type[ctypes.Structure] | type[Int32]) -> int:
-    """Return the request number: _IOC of asm-generic/ioctl.h for the type 'V'."""
+def request_code(name: str, argument: ctypes.Structure | Int32) -> int:
+    """Return the code of a request such as S_FMT: _IOC of asm-generic/ioctl.h for the type 'V'."""
+    number, direction = _REQUESTS[name]
     return direction << 30 | ctypes.sizeof(argument) << 16 | ord("V") << 8 | number
 
 
-QUERYCAP: Final = _request(_READ, 0, Capability)
-S_FMT: Final = _request(_READ | _WRITE, 5, Format)
-REQBUFS: Final = _request(_READ | _WRITE, 8, BufferRequest)
-QUERYBUF: Final = _request(_READ | _WRITE, 9, V4l2Buffer)
-QBUF: Final = _request(_READ | _WRITE, 15, V4l2Buffer)
-DQBUF: Final = _request(_READ | _WRITE, 17, V4l2Buffer)
-STREAMON: Final = _request(_WRITE, 18, Int32)
-G_PARM: Final = _request(_READ | _WRITE, 21, StreamParameters)
-S_PARM: Final = _request(_READ | _WRITE, 22, StreamParameters)
-G_CTRL: Final = _request(_READ | _WRITE, 27, V4l2Control)
-S_CTRL: Final = _request(_READ | _WRITE, 28, V4l2Control)
-QUERYCTRL: Final = _request(_READ | _WRITE, 36, QueryControl)
-
-
-def call(fd: int, request: int, argument: ctypes.Structure | Int32) -> None:
+def call(fd: int, request: str, argument: ctypes.Structure | Int32) -> None:
     """Pass the argument to the driver, which writes its result into it; raise OSError with the driver's errno."""
-    fcntl.ioctl(fd, request, argument, True)
+    fcntl.ioctl(fd, request_code(request, argument), argument, True)
 
 
 def fourcc(code: int) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from calib import se3
 from calib.rig_file import read_rig, rig_toml
 from calib.se2_arrays import transform
-from drivers.cameras.log_camera import LogCamera, LogImages, LogPlayback
+from drivers.cameras.log_camera import LogCamera, LogPlayback
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.commands import options
 from omnid.config import Config
@@ -71,10 +71,9 @@ def run(args: argparse.Namespace) -> int:
 def _run_log(args: argparse.Namespace, config: Config) -> int:
     """Run on the images of a log."""
     cameras = LogCameras(args.lower, args.upper, config.cameras.bits)
-    images = LogImages.load(args.log, cameras)
-    for warning in images.warnings:
+    playback, rig = LogPlayback(args.log, cameras, pace=args.pace, once=args.once), None
+    for warning in playback.warnings:
         log(logging.WARNING, warning)
-    playback, rig = LogPlayback(images, pace=args.pace, once=args.once), None
     if not args.rig:
         with closing(LogReader(args.log, cameras)) as reader:
             rig = attached_rig(reader, args.log)

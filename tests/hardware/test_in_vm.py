@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from calib.rig_file import rig_toml
-from drivers.cameras.log_camera import LogImages
+from drivers.cameras.log_camera import LogPlayback
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.runs.session import attached_rig
@@ -104,8 +104,8 @@ def rig_of_the_sample() -> bytes:
         rig = attached_rig(reader, SAMPLE)
     finally:
         reader.close()
-    images = LogImages.load(SAMPLE)
-    frames: list[Frame] = [frame for both in zip(images.lower, images.upper, strict=False) for _, frame in both]
+    images = LogPlayback(SAMPLE).frames
+    frames: list[Frame] = [frame for both in zip(*images.values(), strict=False) for _, frame in both]
     return rig_toml(with_rims(rig, frames)).encode()
 
 

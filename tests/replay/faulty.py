@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from calib.rig_file import read_rig
-from drivers.cameras.log_camera import LogCamera, LogImages, LogPlayback
+from drivers.cameras.log_camera import LogCamera, LogPlayback
 from drivers.frame import Camera, Frame, gray
 from omnid.config import load_config
 from omnid.runs.live import ConnectedRobot, run_live
@@ -33,8 +33,8 @@ class FaultyCamera(LogCamera):
 
     def __init__(self, playback: LogPlayback, camera: Camera, faults: dict[str, str]) -> None:
         super().__init__(playback, camera)
-        self._camera, self._faults = camera, faults
-        first = gray(self._entries[0][1])
+        self._faults = faults
+        first = gray(playback.frames[camera][0][1])
         self._size, self._dark = first.shape, np.random.default_rng(len(camera))
         self._last = b""  # image without a fault
         self._rng = random.Random(1)
@@ -85,7 +85,7 @@ def main() -> int:
     args = parser.parse_args()
     faults: dict[str, str] = {}
     threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
-    playback = LogPlayback(LogImages.load(args.log))
+    playback = LogPlayback(args.log)
     config = load_config(None, ["controller.motion.check=false", *args.settings, f"motor.port={args.motor}"])
     run_live(
         config,

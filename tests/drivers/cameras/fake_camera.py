@@ -10,8 +10,9 @@ from collections import deque
 from pathlib import Path
 
 from drivers.cameras import v4l2_ioctl as v4l2
-from drivers.cameras.v4l2_controls import AUTO_EXPOSURE, AUTO_GAIN, EXPOSURE, EXPOSURE_MAY_SLOW, GAIN
+from drivers.cameras.v4l2_ioctl import BufferFlag, Capability, ControlId
 
+AUTO_GAIN, GAIN, _, AUTO_EXPOSURE, EXPOSURE, EXPOSURE_MAY_SLOW = ControlId
 APERTURE_PRIORITY = 3
 CONTRAST = 0x00980901
 
@@ -39,28 +40,28 @@ class FakeCamera:
             path.write_bytes(bytes(2 * mmap.PAGESIZE))
         self._path = path
 
-    def fill(self, sequence: int, stamp_ns: int, flags: int = v4l2.TIMESTAMP_MONOTONIC, size: int = 100) -> None:
+    def fill(self, sequence: int, stamp_ns: int, flags: int = BufferFlag.TIMESTAMP_MONOTONIC, size: int = 100) -> None:
         """Let a buffer be filled."""
         self.filled.append((bytes([sequence % 256]) * size, sequence, stamp_ns, flags))
 
-    def call(self, fd: int, request: int, argument: ctypes.Structure) -> None:
+    def call(self, fd: int, request: str, argument: ctypes.Structure) -> None:
         """Answer a call as the kernel does."""
-        if self.failing and request != v4l2.QUERYCTRL:
+        if self.failing and request != "QUERYCTRL":
             raise OSError(self.failing, os.strerror(self.failing))
         {
-            v4l2.QUERYCAP: self._query_capability,
-            v4l2.S_FMT: self._set_format,
-            v4l2.S_PARM: self._set_rate,
-            v4l2.G_PARM: self._get_rate,
-            v4l2.QUERYCTRL: self._query_control,
-            v4l2.G_CTRL: self._get_control,
-            v4l2.S_CTRL: self._set_control,
-            v4l2.QUERYBUF: self._query_buffer,
-            v4l2.DQBUF: self._take_buffer,
+            "QUERYCAP": self._query_capability,
+            "S_FMT": self._set_format,
+            "S_PARM": self._set_rate,
+            "G_PARM": self._get_rate,
+            "QUERYCTRL": self._query_control,
+            "G_CTRL": self._get_control,
+            "S_CTRL": self._set_control,
+            "QUERYBUF": self._query_buffer,
+            "DQBUF": self._take_buffer,
         }.get(request, lambda _: None)(argument)
 
     def _query_capability(self, found: ctypes.Structure) -> None:
-        found.device_caps = found.capabilities = v4l2.CAP_VIDEO_CAPTURE | v4l2.CAP_STREAMING | v4l2.CAP_DEVICE_CAPS
+        found.device_caps = Capability.VIDEO_CAPTURE | Capability.STREAMING
 
     def _set_format(self, wanted: ctypes.Structure) -> None:
         pix = wanted.fmt.pix
@@ -79,7 +80,7 @@ class FakeCamera:
         found.timeperframe = v4l2.Fraction(1000, round(self._rate_hz * 1000))
 
     def _query_control(self, entry: ctypes.Structure) -> None:
-        after = entry.id & ~v4l2.NEXT_CONTROL
+        after = entry.id & ~v4l2.ControlFlag.NEXT_CTRL
         following = sorted(control for control in self.controls if control > after)
         if not following:
             raise OSError(errno.EINVAL, "no more")

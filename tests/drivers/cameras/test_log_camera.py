@@ -10,21 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogImages, LogPlayback
-from drivers.frame import Frame
+from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogPlayback
+from drivers.frame import CAMERAS, Frame
 from drivers.logs.log_reader import LogReader
 from tests.conftest import PAIRS
 
 FAST = 50.0
 
 
-@pytest.fixture(scope="module")
-def recorded(scene: Path) -> LogImages:
-    return LogImages.load(scene / "log.mcap")
-
-
-def test_the_images_are_those_of_the_log(scene: Path, recorded: LogImages) -> None:
-    playback = LogPlayback(recorded, pace=FAST, once=True)
+def test_the_images_are_those_of_the_log(scene: Path) -> None:
+    playback = LogPlayback(scene / "log.mcap", pace=FAST, once=True)
     seen: list[Frame] = list(LogCamera(playback, "upper").frames())
     with closing(LogReader(scene / "log.mcap")) as reader:
         frames = list(reader.frames())
@@ -36,12 +31,11 @@ def test_the_images_are_those_of_the_log(scene: Path, recorded: LogImages) -> No
         assert frame.stamp_ns == pytest.approx(playback.epoch_ns() + since_ns, abs=1)
 
 
-def test_plays_forwards_and_backwards_at_even_intervals(recorded: LogImages) -> None:
+def test_plays_forwards_and_backwards_at_even_intervals(scene: Path) -> None:
     pace, open_end = 1000.0, threading.Event()
-    playback = LogPlayback(recorded, pace=pace)
+    playback = LogPlayback(scene / "log.mcap", pace=pace)
     lower, upper = (
-        [pace * stamp_ns for stamp_ns, _ in islice(playback.due(entries, open_end), 6 * PAIRS)]
-        for entries in (recorded.lower, recorded.upper)
+        [pace * stamp_ns for stamp_ns, _ in islice(playback.due(camera, open_end), 6 * PAIRS)] for camera in CAMERAS
     )
     steps_ns = [b - a for a, b in pairwise(lower)]
     assert min(steps_ns) > 80e6 and max(steps_ns) < 120e6
@@ -49,8 +43,8 @@ def test_plays_forwards_and_backwards_at_even_intervals(recorded: LogImages) -> 
     assert max(apart_ns) < 5e6, "both cameras reverse at the same time"
 
 
-def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) -> None:
-    camera = LogCamera(LogPlayback(recorded, pace=FAST), "lower")
+def test_drops_and_counts_frames_that_are_not_read_in_time(scene: Path) -> None:
+    camera = LogCamera(LogPlayback(scene / "log.mcap", pace=FAST), "lower")
     frames = camera.frames()
     first = next(frames)
     time.sleep(0.4)
@@ -59,9 +53,9 @@ def test_drops_and_counts_frames_that_are_not_read_in_time(recorded: LogImages) 
     assert camera.state.drops == later.seq - first.seq - 1 > 0
 
 
-def test_a_log_starts_when_the_first_camera_is_read(recorded: LogImages) -> None:
+def test_a_log_starts_when_the_first_camera_is_read(scene: Path) -> None:
     """A run may load for longer than the log lasts before it takes the first image."""
-    playback = LogPlayback(recorded, pace=1000, once=True)
+    playback = LogPlayback(scene / "log.mcap", pace=1000, once=True)
     cameras = [LogCamera(playback, name) for name in ("lower", "upper")]
     streams = [camera.frames() for camera in cameras]
     read_ns = time.monotonic_ns()

@@ -24,31 +24,27 @@ from drivers.cameras.camera_state import (
     ExposureSetting,
 )
 from drivers.cameras.v4l2_camera import BufferChecks, V4l2Camera
-from drivers.cameras.v4l2_controls import (
-    AUTO_EXPOSURE,
-    AUTO_GAIN,
-    EXPOSURE,
-    EXPOSURE_MAY_SLOW,
-    GAIN,
-    V4l2Settings,
-    exposure_ranges,
-    follow_request,
-    set_controls,
-)
-from drivers.cameras.v4l2_device import (
-    V4l2Stream,
-    capture_devices,
-    udev_rules,
-)
+from drivers.cameras.v4l2_controls import V4l2Settings, exposure_ranges, follow_request, set_controls
+from drivers.cameras.v4l2_device import V4l2Stream, capture_devices, udev_rules
+from drivers.cameras.v4l2_ioctl import BufferFlag
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from omnid.cli import main
 from omnid.commands import machine
-from tests.drivers.cameras.fake_camera import APERTURE_PRIORITY, CONTRAST, FakeCamera
+from tests.drivers.cameras.fake_camera import (
+    APERTURE_PRIORITY,
+    AUTO_EXPOSURE,
+    AUTO_GAIN,
+    CONTRAST,
+    EXPOSURE,
+    EXPOSURE_MAY_SLOW,
+    GAIN,
+    FakeCamera,
+)
 from tests.waiting import wait_until
 
 SIZES = {  # struct v4l2_...: (64 bits, 32 bits)
-    "Capability": (104, 104), "PixelFormat": (48, 48), "Format": (208, 204), "StreamParameters": (204, 204),
+    "DeviceCapability": (104, 104), "PixelFormat": (48, 48), "Format": (208, 204), "StreamParameters": (204, 204),
     "BufferRequest": (20, 20), "V4l2Buffer": (88, 68), "QueryControl": (68, 68), "V4l2Control": (8, 8),
 }  # fmt: skip
 OFFSETS = {
@@ -56,11 +52,13 @@ OFFSETS = {
     ("V4l2Buffer", "m"): (64, 52), ("V4l2Buffer", "length"): (72, 56), ("Format", "fmt"): (8, 4),
     ("StreamParameters", "capability"): (4, 4), ("StreamParameters", "timeperframe"): (12, 12),
 }  # fmt: skip
-REQUESTS = {
-    "QUERYCAP": (0x80685600, 0x80685600), "S_FMT": (0xC0D05605, 0xC0CC5605), "REQBUFS": (0xC0145608, 0xC0145608),
-    "QUERYBUF": (0xC0585609, 0xC0445609), "QBUF": (0xC058560F, 0xC044560F), "DQBUF": (0xC0585611, 0xC0445611),
-    "STREAMON": (0x40045612, 0x40045612), "G_PARM": (0xC0CC5615, 0xC0CC5615), "S_PARM": (0xC0CC5616, 0xC0CC5616),
-    "G_CTRL": (0xC008561B, 0xC008561B), "S_CTRL": (0xC008561C, 0xC008561C), "QUERYCTRL": (0xC0445624, 0xC0445624),
+REQUESTS = {  # code by its argument and name
+    ("DeviceCapability", "QUERYCAP"): (0x80685600, 0x80685600), ("Format", "S_FMT"): (0xC0D05605, 0xC0CC5605),
+    ("BufferRequest", "REQBUFS"): (0xC0145608, 0xC0145608), ("V4l2Buffer", "QUERYBUF"): (0xC0585609, 0xC0445609),
+    ("V4l2Buffer", "QBUF"): (0xC058560F, 0xC044560F), ("V4l2Buffer", "DQBUF"): (0xC0585611, 0xC0445611),
+    ("Int32", "STREAMON"): (0x40045612, 0x40045612), ("StreamParameters", "G_PARM"): (0xC0CC5615, 0xC0CC5615),
+    ("StreamParameters", "S_PARM"): (0xC0CC5616, 0xC0CC5616), ("V4l2Control", "G_CTRL"): (0xC008561B, 0xC008561B),
+    ("V4l2Control", "S_CTRL"): (0xC008561C, 0xC008561C), ("QueryControl", "QUERYCTRL"): (0xC0445624, 0xC0445624),
 }  # fmt: skip
 
 
@@ -76,7 +74,8 @@ def test_structures_and_requests_are_the_kernels(abi: tuple[dict[str, Any], int]
     assert {name: ctypes.sizeof(names[name]) for name in SIZES} == {name: sizes[bits] for name, sizes in SIZES.items()}
     found = {(struct, member): getattr(names[struct], member).offset for struct, member in OFFSETS}
     assert found == {member: offsets[bits] for member, offsets in OFFSETS.items()}
-    assert {name: names[name] for name in REQUESTS} == {name: numbers[bits] for name, numbers in REQUESTS.items()}
+    codes = {(kind, name): names["request_code"](name, names[kind]()) for kind, name in REQUESTS}
+    assert codes == {request: numbers[bits] for request, numbers in REQUESTS.items()}
 
 
 PORT = "pci-0000:00:14.0-usb-0:1:1.0"
@@ -334,13 +333,13 @@ class Buffers:
 
     def __init__(self) -> None:
         self.state, self.events = CameraState(), list[tuple[int, str]]()
-        self.checks = BufferChecks("lower camera", self.state, lambda *event: self.events.append(event))
+        self.checks = BufferChecks("lower camera", self.state, 10.0, lambda *event: self.events.append(event))
 
     def accepted(self, *buffers: dict[str, int]) -> list[bool]:
-        usual = {"flags": v4l2.TIMESTAMP_MONOTONIC, "bytesused": MIN_BYTES}
+        usual = {"flags": BufferFlag.TIMESTAMP_MONOTONIC, "bytesused": MIN_BYTES}
         return [self.checks.accept(v4l2.V4l2Buffer(**(usual | buffer)), MIN_BYTES) for buffer in buffers]
 
-    def stamp(self, stamp_ns: int, arrival_ns: int, flags: int = v4l2.TIMESTAMP_MONOTONIC) -> int:
+    def stamp(self, stamp_ns: int, arrival_ns: int, flags: int = BufferFlag.TIMESTAMP_MONOTONIC) -> int:
         buffer = v4l2.V4l2Buffer(flags=flags)
         buffer.timestamp.tv_sec, rest_ns = divmod(stamp_ns, 10**9)
         buffer.timestamp.tv_usec = rest_ns // 1000
@@ -367,7 +366,7 @@ def test_gaps_of_the_sequence_are_drops_and_a_restart_drops_nothing(
     assert (buffers.state.drops, buffers.state.restarts) == (drops, restarts)
 
 
-@pytest.mark.parametrize("broken", [{"flags": v4l2.BUFFER_ERROR}, {"bytesused": 99}])
+@pytest.mark.parametrize("broken", [{"flags": BufferFlag.ERROR}, {"bytesused": 99}])
 def test_broken_buffers_are_errors_and_not_drops(buffers: Buffers, broken: dict[str, int]) -> None:
     assert buffers.accepted({}, broken | {"sequence": 1}, {"sequence": 2}) == [True, False, True]
     assert (buffers.state.errors, buffers.state.drops) == (1, 0)

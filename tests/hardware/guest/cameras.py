@@ -46,7 +46,7 @@ def press(device: str, control_id: int) -> None:
     """Press a control without the driver."""
     fd = os.open(device, os.O_RDWR)
     try:
-        v4l2.call(fd, v4l2.S_CTRL, v4l2.V4l2Control(control_id, 1))
+        v4l2.call(fd, "S_CTRL", v4l2.V4l2Control(control_id, 1))
     finally:
         os.close(fd)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from drivers.cameras import v4l2_ioctl as v4l2
-from drivers.cameras.log_camera import LogImages
+from drivers.cameras.log_camera import LogPlayback
 from drivers.frame import Camera
 from omnid.client import Diagnostics, Pose, Robot, Unreachable
 from omnid.transport.codec import decode_diagnostics, decode_pose
@@ -67,8 +67,8 @@ class SampleLog:
     """The sample log on both cameras, forwards and backwards, one step after each published pose."""
 
     def __init__(self) -> None:
-        images = LogImages.load(SAMPLE / "log.mcap")
-        self._data = [[bytes(timed[1].data) for timed in frames] for frames in (images.lower, images.upper)]
+        images = LogPlayback(SAMPLE / "log.mcap").frames
+        self._data = [[bytes(timed[1].data) for timed in frames] for frames in images.values()]
         self._last = min(map(len, self._data)) - 1
         self._step, self._moved = 0, threading.Event()
         self._cameras: dict[Camera, Loopback] = {}
@@ -198,8 +198,8 @@ class Loopback:
         asked = v4l2.Format(type=OUTPUT)
         pix = asked.fmt.pix
         pix.width, pix.height, pix.pixelformat, pix.field = *size_px, v4l2.fourcc_code(pixel_format), v4l2.PROGRESSIVE
-        v4l2.call(self._fd, v4l2.S_FMT, asked)
-        v4l2.call(self._fd, v4l2.STREAMON, v4l2.Int32(OUTPUT))  # else the end of the writer is not visible to readers
+        v4l2.call(self._fd, "S_FMT", asked)
+        v4l2.call(self._fd, "STREAMON", v4l2.Int32(OUTPUT))  # else the end of the writer is not visible to readers
 
     def write(self, image: bytes) -> None:
         """Write an image; the kernel stamps it now."""

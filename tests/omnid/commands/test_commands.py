@@ -85,14 +85,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from drivers.cameras.log_camera import LogCamera, LogImages, LogPlayback
+from drivers.cameras.log_camera import LogCamera, LogPlayback
 from omnid.config import Config
 from omnid.runs.live import record_frames
 
 log, rig, folder = map(Path, sys.argv[1:])
 config = Config()
 config = replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=100))
-playback = LogPlayback(LogImages.load(log), pace=3.0)
+playback = LogPlayback(log, pace=3.0)
 
 class Camera(LogCamera):
     def frames(self):
