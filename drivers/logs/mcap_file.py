@@ -3,8 +3,7 @@
 They are framed here and not by the package `mcap`, whose readers refuse a file that was cut, end at the first corrupt
 chunk, accept a short read as a message and unpack without a bound. That package parses the records but messages.
 
-No index of a file is used: the head of each message is read where it is. Of the summary only channels and schemas
-count, which may have been defined in a corrupt chunk.
+No index or summary of a file is used: the head of each message is read where it is.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from io import BytesIO
@@ -26,7 +25,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, Schema
+from mcap.records import Attachment, Channel, Chunk, Schema
 
 from drivers.errors import DriverError, RecordError
 from drivers.logs.log import ENTRY, KEPT_CHUNKS, LATEST_NS, MAX_RECORD_BYTES, Entries, LogFile, Topic
@@ -103,20 +102,17 @@ class McapFile(LogFile):
     def entries(self) -> Entries:
         """Return the places of all messages: of those in chunks the block is where the chunk begins, else 0."""
         # 1. The records of the file, up to the first one that was cut.
-        blocks, summary, end, size = list[_Record](), list[_Record](), len(MAGIC), os.fstat(self._file.fileno()).st_size
+        blocks, has_end, end, size = list[_Record](), False, len(MAGIC), os.fstat(self._file.fileno()).st_size
         for record in _records(self._file, end):
             if record.end > size:
                 break
             end = record.end
-            if record.opcode == Opcode.DATA_END or summary:
-                summary.append(record)
-            elif record.opcode == Opcode.ATTACHMENT:
+            has_end |= record.opcode == Opcode.DATA_END
+            if record.opcode == Opcode.ATTACHMENT:
                 self._attached.append(record)
-            else:
+            elif not has_end:  # the summary follows the end of the data
                 blocks.append(record)
-        is_closed = bool(summary) and _read(self._file, size - len(MAGIC), len(MAGIC)) == MAGIC
-        if is_closed and _is_valid(summary):
-            self._scanned(summary, 0)
+        is_closed = has_end and _read(self._file, size - len(MAGIC), len(MAGIC)) == MAGIC
         # 2. What they define, and the messages.
         found = [np.empty(0, ENTRY)]
         for record in blocks:
@@ -200,16 +196,6 @@ class McapFile(LogFile):
                 raise RecordError(f"the schema {found.schema_id} of the channel {found.id} is unknown")
             kind = self._types[found.schema_id] if found.message_encoding in ("cdr", "ros1") else ""
             self.topics.setdefault(found.id, Topic(found.topic, kind, found.message_encoding != "ros1"))
-
-
-def _is_valid(summary: Sequence[_Record]) -> bool:
-    """True if the checksum in the footer, the last record, is that of the summary."""
-    with suppress(RecordError):
-        footer, last = summary[-1].parsed(Footer), summary[-1]
-        begin = footer.summary_start or last.begin
-        content = _read(last.source, begin, last.end - _CRC.size - begin)
-        return footer.summary_crc in (0, zlib.crc32(content))
-    return False
 
 
 def _ros_name(schema_name: str) -> str:

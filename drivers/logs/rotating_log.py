@@ -21,6 +21,7 @@ from typing import Literal
 
 from mcap.writer import CompressionType
 
+from drivers.backoff import Backoff
 from drivers.errors import DriverError, EventCallback
 from drivers.logs.mcap_writer import LogWriter, is_locked
 
@@ -29,12 +30,11 @@ from drivers.logs.mcap_writer import LogWriter, is_locked
 class RotationSettings:
     """Limits at which a new file is started, and limits of the files kept."""
 
-    file_bytes: int = 500_000_000  # size at which a new file is started
+    file_bytes: int  # size at which a new file is started
+    keep_bytes: int  # of all files, including the one being written at its full size
+    free_bytes: int  # reserved on the disk: with less free space nothing is recorded
     file_s: float = 600.0  # age at which a new file is started, by the stamps
-    keep_bytes: int = 20_000_000_000  # of all files, including the one being written at its full size
-    free_bytes: int = 1_000_000_000  # reserved on the disk: with less free space nothing is recorded
     sync_s: float = 3.0  # period of writing to the disk (fsync)
-    retry_s: float = 5.0  # wait between two tries after a failure of the disk
 
 
 @dataclass(slots=True)
@@ -70,6 +70,7 @@ class RotatingLog:
         self._own: dict[str, int] = {}  # number in this run of its files: the clock may be set back meanwhile
         self._start_ns = 0  # first stamp of the file
         self._synced_s = self._retry_at_s = 0.0
+        self._waits = Backoff()
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
@@ -86,6 +87,7 @@ class RotatingLog:
             writer.write(topic, schema_name, data, stamp_ns)
             if self.state.status == "stopped" and writer.persisted:
                 self.state.status, self.state.problem = "recording", ""
+                self._waits.reset()
                 self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; lost: {self.state.lost}")
             # 2. The disk.
             if time.monotonic() - self._synced_s >= keep.sync_s:
@@ -136,7 +138,7 @@ class RotatingLog:
             if not writer.persisted:
                 self.state.files -= 1
                 self._path.unlink(missing_ok=True)
-        self.state.problem, self._retry_at_s = str(error), time.monotonic() + self._rotation.retry_s
+        self.state.problem, self._retry_at_s = str(error), time.monotonic() + self._waits.next_s()
 
     def _delete_oldest(self) -> None:
         """Delete the oldest recordings of this name until there is room for one more within the limit.

@@ -26,7 +26,7 @@ from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, Ent
 
 ROOT = Path(__file__).parents[3]
 RIG = {"rig.toml": b"version = 1"}
-ROOMY = RotationSettings(file_bytes=10**9, file_s=1e6, keep_bytes=10**10, free_bytes=0, retry_s=0.5)
+ROOMY = RotationSettings(file_bytes=10**9, file_s=1e6, keep_bytes=10**10, free_bytes=0)
 TICK_NS = 33_333_333
 
 

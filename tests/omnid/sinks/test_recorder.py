@@ -189,7 +189,7 @@ def attached(path: Path) -> list[str]:
 
 
 def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(file_s=1.0, free_bytes=0))
+    monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(10**9, 10**10, 0, file_s=1.0))
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, clock=set_clock(), encode=Encoder(np.eye(4), 0))
     for n in range(30):
