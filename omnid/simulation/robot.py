@@ -30,11 +30,12 @@ from drivers.motor import VelocityCommand
 from drivers.motors.simulated_motor import MotionLimits, Pose, SimulatedMotor
 from omnid.config import Config
 from omnid.controller.controller import Controller
-from omnid.controller.ipc import TickReport
+from omnid.controller.ipc import LONGEST_RAMP_S, TickReport
 from omnid.core.control.arming import ArmRequest, ContactState
 from omnid.core.control.collision_monitor import ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlInput, ControllerPose
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.world import Walkers, World, clearance_m
@@ -123,7 +124,6 @@ class SimulatedCameras:
 
 
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
-STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.
 # What a controller is given; a stop disarms.
 Given: TypeAlias = ControlInput | ContactState | Literal["stop"]
 
@@ -254,7 +254,7 @@ class Vehicle:
     def come_to_rest(self) -> None:
         """Have the controller stop the wheels permanently."""
         self.controller.end()
-        self.advance(self.now_ns + STOPPING_NS)
+        self.advance(self.now_ns + round(LONGEST_RAMP_S / S_PER_NS))
 
     def move(self, dt_s: float) -> None:
         """Move the base by its wheels until now, for a time."""

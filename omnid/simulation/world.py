@@ -15,8 +15,6 @@ from omnid.simulation.rendering.surfaces import Rectangle
 
 Point = tuple[float, float]
 
-PATIENCE_S = 4.0  # A person who walks back and forth waits this long for the robot, then turns round.
-
 
 @dataclass(frozen=True, slots=True)
 class Person:
@@ -28,7 +26,6 @@ class Person:
     repeat: str = "once"  # once | loop | back and forth
     start_s: float = 0.0
     starts_within_m: float = 0.0  # waits until the robot is this near to the last point of the path; 0: does not wait
-    waits_within_m: float = 0.0  # stops rather than come nearer than this to the robot; 0: walks on
     rests_s: tuple[float, ...] = ()  # at the points of a path that is walked once; none: does not rest
 
     def place(self, walked_s: float) -> tuple[float, float, float]:
@@ -51,13 +48,6 @@ class Person:
         x_m, y_m = (float(np.interp(along_m, reached_m, points[:, axis])) for axis in (0, 1))
         return x_m, y_m, math.atan2(ahead[1], ahead[0])
 
-    def turned(self, walked_s: float) -> float:
-        """Return the time of walking, of a path back and forth, that has the same place on the way back."""
-        lengths_m = np.linalg.norm(np.diff(np.array(self.path), axis=0), axis=1)
-        leg_s = float(lengths_m.sum()) / self.speed_mps
-        leg, on_it_s = divmod(walked_s, leg_s)
-        return (leg + 2) * leg_s - on_it_s
-
 
 class Walkers:
     """The people of a world as time passes; those who wait for the robot begin when it is near enough."""
@@ -65,35 +55,15 @@ class Walkers:
     def __init__(self, people: tuple[Person, ...]) -> None:
         self._people = people
         self._started_s: list[float | None] = [None if person.starts_within_m else person.start_s for person in people]
-        self._waited_s = [0.0] * len(people)
         self.time_s = 0.0
 
     def advance(self, time_s: float, robot: Point) -> None:
         """Set the time, with the robot at a point [m]."""
-        passed_s, self.time_s = time_s - self.time_s, time_s
+        self.time_s = time_s
         for number, person in enumerate(self._people):
-            started_s = self._started_s[number]
-            if person.waits_within_m and started_s is not None:
-                self._started_s[number] = self._polite(number, started_s, passed_s, robot)
-            if (
-                self._started_s[number] is None
-                and time_s >= person.start_s
-                and (math.dist(robot, person.path[-1]) <= person.starts_within_m)
-            ):
+            is_near = math.dist(robot, person.path[-1]) <= person.starts_within_m
+            if self._started_s[number] is None and time_s >= person.start_s and is_near:
                 self._started_s[number] = time_s
-
-    def _polite(self, number: int, started_s: float, passed_s: float, robot: Point) -> float:
-        """Return the start time of a person: for one who waits for the robot it is delayed by the step."""
-        person, walked_s = self._people[number], self.time_s - started_s
-        before_m, now_m = (math.dist(person.place(at_s)[:2], robot) for at_s in (walked_s - passed_s, walked_s))
-        if now_m >= before_m or now_m >= person.waits_within_m:
-            self._waited_s[number] = 0.0
-            return started_s
-        self._waited_s[number] += passed_s
-        if self._waited_s[number] < PATIENCE_S or person.repeat != "back and forth":
-            return started_s + passed_s
-        self._waited_s[number] = 0.0
-        return self.time_s - person.turned(walked_s - passed_s)
 
     def faces(self) -> list[Rectangle]:
         """Return the people's rectangles in the world now."""

@@ -30,14 +30,13 @@ from omnid.simulation.rendering import surfaces
 from omnid.simulation.rendering.surfaces import CEILING_M, Point, Random, Rectangle
 from omnid.simulation.world import Person, World
 
-MAX_BYTES: Final = 1 << 18
+MAX_BYTES: Final = 1 << 18  # which also bounds the numbers of things
 PX_PER_M, FLOOR_PX_PER_M = 200.0, 120.0  # Textures of walls, and of floor and ceiling.
 KINDS: Final = ("brick", "plaster", "granite", "plaster")  # Textures of a random wall.
 Side: TypeAlias = Annotated[float, Meta(ge=0.02, le=20.0)]  # m
 Distance: TypeAlias = Annotated[float, Meta(ge=0.0, le=100.0)]  # m
 Size: TypeAlias = tuple[Side, Side, Side]
-Path: TypeAlias = Annotated[tuple[Point, ...], Meta(min_length=2, max_length=100)]
-Many: Final = Meta(max_length=200)
+Path: TypeAlias = Annotated[tuple[Point, ...], Meta(min_length=2)]
 # Of surfaces.PAINTERS.
 Texture: TypeAlias = Literal[
     "brick", "plaster", "granite", "tiles", "plain", "white", "linoleum", "epoxy", "marbled", "carpet"
@@ -60,7 +59,7 @@ class Wall(Struct, frozen=True):
     height_m: Side | None = None  # None: up to the ceiling
     posters_per_m: Annotated[float, Meta(ge=0.0, le=4.0)] = 0.0
     poster_sides: Literal["front", "both"] = "front"
-    doors: Annotated[tuple[Door, ...], Many] = ()
+    doors: tuple[Door, ...] = ()
 
 
 class Box(Struct, frozen=True):
@@ -81,7 +80,6 @@ class Walker(Struct, frozen=True):
     repeat: Literal["once", "loop", "back and forth"] = "once"
     start_s: Annotated[float, Meta(ge=0.0)] = 0.0
     starts_within_m: Distance = 0.0
-    waits_within_m: Distance = 0.0
     size_m: Size = (0.25, 0.45, 1.7)  # depth, width, height
 
 
@@ -118,9 +116,9 @@ class WorldTable(Struct, frozen=True):
     start: tuple[float, float, float]
     space: Space
     light: Annotated[float, Meta(ge=0.05, le=3.0)] = 1.0
-    wall: Annotated[tuple[Wall, ...], Many] = ()
-    box: Annotated[tuple[Box, ...], Many] = ()
-    person: Annotated[tuple[Walker, ...], Many] = ()
+    wall: tuple[Wall, ...] = ()
+    box: tuple[Box, ...] = ()
+    person: tuple[Walker, ...] = ()
 
 
 def shipped_worlds() -> list[str]:

@@ -7,7 +7,7 @@ the pose; when slip was noticed, after it began, and how many pairs noticed it a
 
 routes: in the corridor around the rooms of `building` a route is taught: a round of 33 m, or its first metres. It is
 repeated in the saved map from other starts on it, with other light, a fifth of the posters exchanged, and two people
-who walk across the corridor and wait for a near robot.
+who walk across the corridor when the robot comes near.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ def later(seed: int, number: int, rng: random.Random) -> World:
         else face
         for face in building.standing
     )
-    person = replace(load_world("corridor").people[0], repeat="back and forth", waits_within_m=1.0)
+    person = replace(load_world("corridor").people[0], repeat="once", starts_within_m=3.0)
     walking = tuple(
         replace(person, path=path, speed_mps=rng.uniform(0.6, 1.0), start_s=rng.uniform(0.0, 10.0)) for path in DOORS
     )

@@ -9,7 +9,7 @@ shutter every row has a pose of its own.
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.caster_kernels import cast
+from omnid.simulation.rendering.ray_caster_kernels import cast
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 Floats = NDArray[np.float32]
@@ -170,7 +170,7 @@ def render_grey(
 
 
 def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Array) -> Floats:
-    """Return what the ray caster knows of rectangles (R, 4, 4), in the camera frame; see caster_kernels.
+    """Return what the ray caster knows of rectangles (R, 4, 4), in the camera frame; see ray_caster_kernels.
 
     nearest_m (R,): least distance of each from the origin of any ray.
     """
@@ -228,19 +228,17 @@ class Atlas:
     levels: NDArray[np.int64]  # (L, 3) first texel, height, width
 
 
-_atlases: list[Atlas] = []  # the one used last at the end
+_atlases: dict[Hashable, Atlas] = {}  # by the ids of the textures
 
 
 def cached_atlas(textures: Sequence[Texture]) -> Atlas:
-    """Return the atlas of textures; the texels of one that has them all are shared, whatever their order."""
-    for number, atlas in enumerate(_atlases):
-        rows = {id(texture): row for row, texture in enumerate(atlas.textures)}
-        if all(id(texture) in rows for texture in textures):
-            _atlases.append(_atlases.pop(number))
-            return replace(atlas, pyramids=atlas.pyramids[[rows[id(texture)] for texture in textures]])
-    del _atlases[: len(_atlases) - KEPT + 1]
-    _atlases.append(_make_atlas(textures))
-    return _atlases[-1]
+    """Return the atlas of textures, made once for a scene."""
+    key = tuple(map(id, textures))
+    if key not in _atlases:
+        for oldest in list(_atlases)[: len(_atlases) - KEPT + 1]:
+            del _atlases[oldest]
+        _atlases[key] = _make_atlas(textures)
+    return _atlases[key]
 
 
 def _make_atlas(textures: Sequence[Texture]) -> Atlas:
