@@ -35,7 +35,7 @@ from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
 from omnid.sinks.files import check_outputs
-from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
+from omnid.transport.topics import PANORAMA, SCAN
 
 if TYPE_CHECKING:  # it imports rerun, which may be missing
     from omnid.viewer.rerun_sink import RerunSink
@@ -201,7 +201,7 @@ def _viewer() -> str:
 def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | None) -> None:
     """Draw what is recorded. Raise OmnidError where there is no pose in it."""
     with closing(RecordingReader(log, topic, robot)) as reader:
-        for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
+        for message in reader.messages((ODOMETRY, STATUS, CLOUD, SCAN, reader.image_name())):
             with suppress(FrameDecodeError):
                 sink.draw(message.content)
     if unreadable := reader.unreadable.total() + len(reader.log.faults) + bool(reader.log.cut):
@@ -217,7 +217,7 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
         handle_stop_signals(lambda number, _: signals.append(number)),
         Robot(settings=config.bus) as robot,
     ):
-        for topic in (ODOMETRY, MAP_POSE, SCAN, PANORAMA, STATUS, CLOUD):
+        for topic in (ODOMETRY, SCAN, PANORAMA, STATUS, CLOUD):
             robot.on_message(state.put, topic, kept=topic in (STATUS, CLOUD))
         while time.monotonic() < end_s and not signals:
             _, content = state.next(0.5) or (None, None)

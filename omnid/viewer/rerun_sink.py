@@ -1,34 +1,33 @@
 """A run drawn in Rerun: a replay as it computes, a recording, or a live robot by its messages; time is the stamp.
 
 Entities: odom (the world) with path, map, and base_link with obstacles and the points of
-the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, correction;
+the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma;
 state; log. Colours are those of Okabe and Ito, which colour-blind people can distinguish.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
-from typing import Any, Final, SupportsFloat, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from calib import se3
 from drivers.frame import Frame, gray
-from omnid.core.frames import base_pose
 from omnid.core.odometry.stereo_frame import Features
-from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.messages import OdometryUpdate
 from omnid.plain_text import plain
 from omnid.recordings.recording import Content
 from omnid.sinks.encoder import Encoder, Outgoing, pose_attachment
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
-from omnid.transport.codec import Cloud, Diagnostics, Panorama, Pose, PoseInMap, Scan
+from omnid.transport.codec import Cloud, Diagnostics, Panorama, Pose, Scan
 from omnid.transport.status_names import ODOMETRY, short_name
 from omnid.transport.topics import PUBLISHED, SCAN
 
@@ -49,7 +48,6 @@ PLOTS: Final = {
     "yaw_rate": "Yaw rate",
     "landmarks": "Landmarks",
     "sigma": "Standard deviation",
-    "correction": "Correction by the map",
 }
 # Topics of a replay that are drawn; the pose in the map is not, because it may come before that in odom.
 REPLAYED: Final = ("odom", "status", "cloud", SCAN)
@@ -95,7 +93,6 @@ class RerunSink:
         self._end: Array | None = None  # (3,) m, of the path
         self._state = "unknown"
         self._shown_state = self._state
-        self._poses: deque[Pose] = deque(maxlen=100)  # a pose in the map comes later than that in odom
         self._messages: dict[str, tuple[int, str]] = {}  # level and message of each status
         self.poses = self.images = 0
 
@@ -104,9 +101,6 @@ class RerunSink:
         match content:
             case Pose():
                 self._pose(content)
-            case PoseInMap(stamp_ns, T_map_base):
-                for pose in (pose for pose in self._poses if pose.stamp_ns == stamp_ns):
-                    self.correction(stamp_ns, T_map_base @ se3.inverse(pose.T_odom_base))
             case Diagnostics():
                 self._status(content)
             case Cloud() if self.wants("cloud"):
@@ -146,10 +140,6 @@ class RerunSink:
         stream.log("depth", image)
         stream.log("odom/base_link/points", _points_3d(points, RIG_POINTS, THIN))
 
-    def correction(self, stamp_ns: int, T_map_odom: Array) -> None:
-        """Plot by how much the map corrects odometry."""
-        self._plot_errors(stamp_ns, "correction", np.linalg.norm(T_map_odom[:-1, -1]), se3.yaw(T_map_odom))
-
     def close(self) -> None:
         """Flush and end the drawing; a second call does nothing."""
         stream, self._stream = self._stream, None
@@ -185,17 +175,11 @@ class RerunSink:
         if np.isfinite(value):
             self._at(stamp_ns).log([plot, name], rr.Scalars(value))
 
-    def _plot_errors(self, stamp_ns: int, plot: str, position_m: SupportsFloat, heading_rad: ArrayLike) -> None:
-        """Plot a position and a heading, both small, in thousandths of m and degrees."""
-        self._plot(stamp_ns, plot, "position mm", 1e3 * float(position_m))
-        self._plot(stamp_ns, plot, "heading mdeg", 1e3 * float(np.rad2deg(heading_rad)))
-
     def _pose(self, pose: Pose) -> None:
         """Draw the robot and the newest piece of its path; plot its covariance, speeds and landmarks."""
         if pose.attachment.seq >= 0:
             self._state = pose.state
         self._show_state(pose.stamp_ns)
-        self._poses.append(pose)
         self.poses += 1
         if not self.wants("pose"):
             return
@@ -208,7 +192,9 @@ class RerunSink:
         # 2. The plots.
         if np.isfinite(pose.covariance).all():
             sigma_m = math.sqrt(max(0.0, np.linalg.eigvalsh(pose.covariance[:3, :3])[-1]))
-            self._plot_errors(stamp_ns, "sigma", sigma_m, np.sqrt(max(0.0, pose.covariance[-1, -1])))
+            sigma_deg = math.degrees(math.sqrt(max(0.0, pose.covariance[-1, -1])))
+            self._plot(stamp_ns, "sigma", "position mm", 1e3 * sigma_m)
+            self._plot(stamp_ns, "sigma", "heading deg", sigma_deg)
         self._plot(stamp_ns, "speed", "m/s", float(np.linalg.norm(pose.velocity[:3])))
         self._plot(stamp_ns, "yaw_rate", "deg/s", float(np.rad2deg(pose.velocity[-1])))
         if pose.attachment.seq >= 0:
@@ -263,9 +249,6 @@ class ReplayDrawing:
             dense = self._dense.of(message.depth)
             focal_baseline = self._geometry.cylinder.focal_px * rig.baseline_m
             sink.depth(message.stamp_ns, dense.disparity, focal_baseline, se3.apply(rig.T_base_rig, dense.points))
-        elif isinstance(message, PlaceUpdate):
-            T_map_odom, _ = base_pose(message.T_map_odom, message.covariance, rig.T_base_rig)
-            sink.correction(message.stamp_ns, T_map_odom)
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:

@@ -141,7 +141,6 @@ def publish(bus: Bus, number: int) -> None:
         pose if number % 7 else b"nonsense",
         PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes(),
     )
-    bus.publish("map_pose", codec.map_pose_cdr(stamp_ns, se3.exp([0.2, 0, 0, 0, 0, 0]) @ T, np.eye(6)))
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
     statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
@@ -172,8 +171,6 @@ def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
     assert len(numbers) > 20 and (np.diff(numbers) > 0).all() and not (numbers % 7 == 0).any()
     np.testing.assert_allclose(xyz, np.column_stack([0.01 * numbers, 0.5 + 0 * numbers, 0 * numbers]), atol=1e-5)
     assert rows(drawn, "/state", "StateChange:state")[0].value == ["degraded"]
-    corrections = rows(drawn, "/correction/position\\ mm", "Scalars:scalars")
-    assert corrections and corrections[0].value == [pytest.approx(200.0)]
     assert rows(drawn, "/panorama", "EncodedImage:blob") and rows(drawn, "/odom/map", "Points3D:positions")
 
 
