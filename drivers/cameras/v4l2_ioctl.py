@@ -23,12 +23,8 @@ class Capability(IntFlag):
     STREAMING = 0x04000000
 
 
-class BufferFlag(IntFlag):
-    """V4L2_BUF_FLAG_*."""
-
-    ERROR = 0x40
-    TIMESTAMP_MASK = 0xE000
-    TIMESTAMP_MONOTONIC = 0x2000
+# V4L2_BUF_FLAG_*
+BufferFlag = IntFlag("BufferFlag", {"ERROR": 0x40, "TIMESTAMP_MONOTONIC": 0x2000, "TIMESTAMP_MASK": 0xE000})
 
 
 class ControlFlag(IntFlag):
@@ -39,15 +35,18 @@ class ControlFlag(IntFlag):
     NEXT_CTRL = 0x80000000
 
 
-class ControlId(IntEnum):
-    """V4L2_CID_* of linux/v4l2-controls.h."""
-
-    AUTO_GAIN = 0x00980912
-    GAIN = 0x00980913
-    POWER_LINE_FREQUENCY = 0x00980918
-    AUTO_EXPOSURE = 0x009A0901
-    EXPOSURE = 0x009A0902
-    EXPOSURE_AUTO_PRIORITY = 0x009A0903  # automatic exposure may lower the rate
+# V4L2_CID_* of linux/v4l2-controls.h; by EXPOSURE_AUTO_PRIORITY automatic exposure may lower the rate.
+ControlId = IntEnum(
+    "ControlId",
+    {
+        "AUTO_GAIN": 0x00980912,
+        "GAIN": 0x00980913,
+        "POWER_LINE_FREQUENCY": 0x00980918,
+        "AUTO_EXPOSURE": 0x009A0901,
+        "EXPOSURE": 0x009A0902,
+        "EXPOSURE_AUTO_PRIORITY": 0x009A0903,
+    },
+)
 
 
 class ExposureMode(IntEnum):
