@@ -16,7 +16,7 @@ from omnid.core.control.arming import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerSettings
 from omnid.core.control.heading_controller import STOP, Twist
 from omnid.core.control.motion_monitor import Motion
-from omnid.core.control.safety_rules import AWAITED, FAILED, STOPPED
+from omnid.core.control.safety_rules import AWAITED, BUMPER, CLIFF, FAILED, STOPPED
 from omnid.core.nanoseconds import S_PER_NS
 
 
@@ -152,7 +152,8 @@ class Controller:
         self._motor_stopped = status.watchdog_expired
         self.state.expiries += status.watchdog_expired
         self.state.fault, self.state.battery_v = status.fault, status.battery_v
-        self._law.contacts.update(MOTOR, ContactState(status.bumper, status.cliff))
+        holding = {contact for contact, holds in ((BUMPER, status.bumper), (CLIFF, status.cliff)) if holds}
+        self._law.contacts.update(MOTOR, ContactState(frozenset(holding)))
         if status.watchdog_expired:  # the base is at rest: the command was not obeyed
             self._law.motion = STOP
         self._law.goal.update(status.heading_rad)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from omnid.core.control.safety_rules import ASKED, BUMPER, CLIFF, LATCHING
+from omnid.core.control.safety_rules import ASKED, LATCHING
 
 MANUAL: Final = "manual"
 AUTOMATIC: Final = "automatic"
@@ -21,18 +21,18 @@ MOTOR: Final = "motor"
 
 
 class ContactState(NamedTuple):
-    """State of the sensors of one origin; the counts show a contact that has begun and ended between two messages."""
+    """State of the sensors of one origin; the count shows a contact that has begun and ended between two messages."""
 
-    bumper: bool = False  # pressed now
-    cliff: bool = False  # no floor now
-    bumper_count: int = 0  # contacts so far
-    cliff_count: int = 0
+    holding: frozenset[str] = frozenset()  # contacts that hold now: BUMPER, CLIFF
+    count: int = 0  # contacts so far
+    newest: str = ""  # the last one that has begun
 
     def after(self, contact: str, *, holds: bool) -> ContactState:
         """Return the state after a message of one sensor (BUMPER, CLIFF)."""
-        if contact == BUMPER:
-            return self._replace(bumper=holds, bumper_count=self.bumper_count + (holds and not self.bumper))
-        return self._replace(cliff=holds, cliff_count=self.cliff_count + (holds and not self.cliff))
+        if not holds:
+            return self._replace(holding=self.holding - {contact})
+        begins = contact not in self.holding
+        return ContactState(self.holding | {contact}, self.count + begins, contact if begins else self.newest)
 
 
 NO_CONTACT: Final = ContactState()
@@ -48,15 +48,12 @@ class Contacts:
     def update(self, origin: str, state: ContactState) -> None:
         """Replace the state of an origin."""
         before, self._states[origin] = self._states.get(origin, NO_CONTACT), state
-        begun = (BUMPER, state.bumper_count > before.bumper_count), (CLIFF, state.cliff_count > before.cliff_count)
-        self._begun |= {contact for contact, has_begun in begun if has_begun}
+        self._begun |= {state.newest} if state.count > before.count else set()
 
     def take(self) -> set[str]:
         """Return the contacts that hold, or have begun since the last call."""
         found, self._begun = self._begun, set()
-        for state in self._states.values():
-            found |= {contact for contact, holds in ((BUMPER, state.bumper), (CLIFF, state.cliff)) if holds}
-        return found
+        return found.union(*(state.holding for state in self._states.values()))
 
 
 class ArmRequest(NamedTuple):

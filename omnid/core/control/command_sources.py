@@ -7,12 +7,10 @@ from typing import Final, NamedTuple
 
 from omnid.core.control.heading_controller import Setpoint
 
-OPERATOR: Final = "operator"
+OPERATOR: Final = "operator"  # has priority
 PLANNER: Final = "planner"
-SOURCES: Final = (OPERATOR, PLANNER)  # in the order of their priority
 
 # Reasons to refuse a command, which are counted.
-UNKNOWN_SOURCE: Final = "unknown source"
 LOWER_PRIORITY: Final = "a source of higher priority drives"
 OTHER_SENDER: Final = "another sender drives"
 
@@ -53,8 +51,6 @@ class CommandSelector:
             self.current = command
 
     def _refusal(self, command: TimedSetpoint) -> str:
-        if command.source not in SOURCES:
-            return UNKNOWN_SOURCE
         current = self.current
         if current is None or command.arrival_ns - current.arrival_ns > self._hold_ns:
             return ""

@@ -93,10 +93,8 @@ class MotionSettings:
     slip: Annotated[float, Meta(ge=0, le=0.95), "plausible slip of the wheels, as a share of the speed"] = 0.4
     speed_mps: float = 0.02  # difference in speed that means nothing, m/s
     yaw_rate_radps: float = 0.15  # difference in yaw rate that means nothing, rad/s
-    slow_m: float = 0.05  # unexplained motion that slows the base down, m
-    stop_m: float = 0.15  # unexplained motion that stops the base, m
-    slow_rad: float = 0.15  # unexplained rotation that slows the base down, rad
-    stop_rad: float = 0.5  # unexplained rotation that stops the base, rad
+    stop_m: float = 0.15  # unexplained motion that stops the base, m; a third of it slows it down
+    stop_rad: float = 0.5  # unexplained rotation that stops the base, rad; a third of it slows it down
 
 
 class Motion(NamedTuple):
@@ -155,10 +153,9 @@ class Plausibility:
     @property
     def is_doubtful(self) -> bool:
         """True if some motion is unexplained: the base is to slow down."""
-        return any(
-            metres > self._settings.slow_m or radians > self._settings.slow_rad
-            for metres, radians in self._unexplained.values()
-        )
+        limits = self._settings.stop_m, self._settings.stop_rad
+        pairs = (pair for sums in self._unexplained.values() for pair in zip(sums, limits, strict=True))
+        return any(3 * amount > limit for amount, limit in pairs)
 
     @property
     def slowed_by(self) -> str:

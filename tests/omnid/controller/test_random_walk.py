@@ -28,7 +28,7 @@ from omnid.core.control.collision_monitor import (
     ControllerScan,
     MovingPoint,
 )
-from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
+from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
@@ -48,7 +48,7 @@ DEADLINES = SETTINGS.deadlines
 HOLD_NS = round(SETTINGS.deadlines.command_s * 1e9)
 # The angle that it turns at the highest rate within 0.15 s, and then until it has braked.
 LEAD_RAD = LIMITS.yaw_rate_radps * 0.15 + LIMITS.yaw_rate_radps**2 / (2 * LIMITS.yaw_acceleration_radps2)
-SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", "c"), ("autopilot", "d"))
+SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", "c"))
 TINY = 1e-9
 FAULTS = frozenset(safety_rules.FAULTS)
 COLLISION = CollisionSettings()
@@ -133,8 +133,6 @@ class Oracle:
     def take_command(self, command: TimedSetpoint) -> None:
         """Take a command if its sender may drive: the first on its source, and none of higher priority before it."""
         now = self.current
-        if command.source not in (OPERATOR, PLANNER):
-            return
         live = now is not None and command.arrival_ns - now.arrival_ns <= HOLD_NS
         if now is None or not live:
             permitted = True
@@ -233,7 +231,7 @@ class Walk:
             asked_ns = self.delayed_ns()
             oracle.take_stop(asked_ns)
             controller.stop(asked_ns)
-        holding = self.contacts.bumper or self.contacts.cliff
+        holding = bool(self.contacts.holding)
         if self.chance(0.3, 0.3) if holding else self.chance(0.001, 0.005):
             self.touch(rng.choice((BUMPER, CLIFF)), holds=not holding)
         while self.chance(0.06, 0.1):

@@ -17,7 +17,6 @@ from omnid.core.control.command_sources import (
     OPERATOR,
     OTHER_SENDER,
     PLANNER,
-    UNKNOWN_SOURCE,
     CommandSelector,
     TimedSetpoint,
 )
@@ -166,8 +165,7 @@ def test_the_first_sender_of_a_source_keeps_it_until_it_is_silent(selector: Comm
     assert selector.refused == {OTHER_SENDER: 11}
 
 
-def test_refuses_unknown_sources_and_keeps_the_newest_of_reordered_commands(selector: CommandSelector) -> None:
-    assert not offer(selector, 0.0, "autopilot") and selector.refused == {UNKNOWN_SOURCE: 1}
+def test_keeps_the_newest_of_reordered_commands(selector: CommandSelector) -> None:
     assert offer(selector, 1.0) and not offer(selector, 0.9)
     assert selector.current is not None and selector.current.arrival_ns == 10**12 + 10**9
 
