@@ -12,7 +12,8 @@ import omnid
 
 if len(sys.argv) != 3:
     sys.exit(__doc__)
-odometry, folder = omnid.Odometry(sys.argv[1]), Path(sys.argv[2])
+_, rig, images = sys.argv
+odometry, folder = omnid.Odometry(rig), Path(images)
 for stamp_ns in sorted(int(path.stem) for path in (folder / "lower").glob("*.png")):
     lower = cv2.imread(str(folder / "lower" / f"{stamp_ns}.png"), cv2.IMREAD_GRAYSCALE)
     upper = cv2.imread(str(folder / "upper" / f"{stamp_ns}.png"), cv2.IMREAD_GRAYSCALE)

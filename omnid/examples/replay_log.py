@@ -6,8 +6,8 @@ import omnid
 
 if len(sys.argv) not in (2, 3):
     sys.exit(__doc__)
-log, *rig = sys.argv[1:]
-result = omnid.replay(log, rig=rig[0] if rig else None)
+_, log, *rig = sys.argv
+result = omnid.replay(log, rig=next(iter(rig), None))
 for warning in result.warnings:
     print("warning:", warning, file=sys.stderr)
 x_m, y_m, _ = result.T_odom_rig[-1, :3, 3]
