@@ -19,7 +19,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Any, Final, Generic, Literal, Self, TypeVar
 
 import zenoh
 
@@ -179,11 +179,8 @@ class Robot(_Closing):
 
         return subscriber.undeclare
 
-    def driver(self, source: str = "") -> Driver:
-        """Return a sender of commands to the wheels.
-
-        source: "operator" or "planner"; empty: the operator, who has priority.
-        """
+    def driver(self, source: Literal["operator", "planner"] = "operator") -> Driver:
+        """Return a sender of commands to the wheels; the operator has priority over the planner."""
         self.now_ns(waits=True)
         return Driver(self, self._session, source)
 
@@ -253,21 +250,17 @@ class Driver:
             driver.twist(0.0, 0.0)
     """
 
-    def __init__(self, robot: Robot, session: zenoh.Session, source: str = "") -> None:
-        prefix = f"cmd/{source}" if source else "cmd"
+    def __init__(self, robot: Robot, session: zenoh.Session, source: Literal["operator", "planner"]) -> None:
         self._robot, self._session, cdr = robot, session, zenoh.Encoding.APPLICATION_CDR
-        self._twist, self._heading = f"{prefix}/{topics.TWIST}", f"{prefix}/{topics.HEADING}"
+        self._twist, self._heading = topics.TWIST, topics.HEADING
+        if source == "planner":
+            self._twist, self._heading = topics.PLANNER_TWIST, topics.PLANNER_HEADING
         self._publishers = {
             topic: session.declare_publisher(f"{robot.name}/{topic}", encoding=cdr, **_QUALITY)
             for topic in (self._twist, self._heading, topics.STOP, topics.ARM)
         }
         self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
         self.asked_ns = 0  # time of sending of the newest request, which the reports of a drive repeat
-
-    @property
-    def connected(self) -> bool:
-        """True if a robot subscribes to the commands."""
-        return has_receiver(self._publishers[topics.STOP])
 
     def require_connected(self) -> None:
         """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""
@@ -279,7 +272,8 @@ class Driver:
 
     def heading(self, velocity_mps: float, heading_rad: float) -> None:
         """Drive with this speed and hold a heading in odom (counter-clockwise)."""
-        self.send(self._heading, codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
+        vector = (velocity_mps, 0.0, heading_rad)
+        self.send(self._heading, codec.encoded(codec.VECTOR_SCHEMA, (time.time_ns(), "odom"), vector))
 
     def stop(self) -> None:
         """Stop the wheels, whatever else was commanded, until `arm` is called."""

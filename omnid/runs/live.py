@@ -29,7 +29,6 @@ from omnid.config import Config
 from omnid.controller.ipc import ARMED, ControllerState
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import MANUAL
-from omnid.core.control.command_sources import SOURCES
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
@@ -139,7 +138,10 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         # 1. The rig, and what is compiled or imported before the first image.
         geometry = session.geometry(rig or read_rig(Path(config.cameras.rig)), ())
         compile_serialisers(
-            [*(topic.schema for topic in topics.PUBLISHED.values()), *topics.command_topics(()).values()]
+            [
+                *(topic.schema for topic in topics.PUBLISHED.values()),
+                *(command.schema for command in topics.COMMANDS.values()),
+            ]
         )
         prepare_kernels()
         import_module("scipy.sparse.linalg")  # what the first loop needs
@@ -226,7 +228,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
 
     # 4. Commands and requests from the bus; without a motor all but those to save the map are refused.
     def add_sample(topic: str, payload: bytes) -> None:
-        motion.add(sample_from_cdr(payload, topics.command_of(topic).schema, clock.stamp_ns))
+        motion.add(sample_from_cdr(payload, topics.COMMANDS[topic].schema, clock.stamp_ns))
 
     def ask(command: NavigationCommand) -> None:
         if navigation is not None and controller is not None:
@@ -237,20 +239,18 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
 
     freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))
     bus.serve(topics.TIME, freshness.own_time)
-    taken = topics.command_topics(SOURCES)
     commands = CommandReceiver(
         freshness,
         controller=controller,
-        sources=SOURCES,
         is_unique=lambda: bus.is_unique,
         navigate=ask if controller is not None else None,
         save_map=run_places.ask if run_places.saves else None,
         sensors={topic: partial(add_sample, topic) for topic, is_taken in takes.items() if is_taken},
-        why_not=dict.fromkeys(taken, NO_MOTOR)
+        why_not=dict.fromkeys(topics.COMMANDS, NO_MOTOR)
         | {topics.MAP: NO_MAP_FILE, **dict.fromkeys(topics.SENSOR_TOPICS, NO_SAMPLES)},
         report=session.warn,
     )
-    bus.subscribe_commands(commands.receive, taken, is_stopped)
+    bus.subscribe_commands(commands.receive, is_stopped)
 
     # 5. The status of all parts.
     session.parts |= {

@@ -145,7 +145,8 @@ class Encoder:
             status = entry(PLACES, {Key.STATE: update.state})
             yield _on("status", codec.diagnostics_cdr(stamp_ns, [status]))
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
-        yield _on(MAP_POSE, codec.map_pose_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance)))
+        pose = (T_map_base, np.ravel(in_outer_axes(T_map_base, covariance)))
+        yield _on(MAP_POSE, codec.encoded(codec.MAP_POSE_SCHEMA, (stamp_ns, "map"), pose))
         if update.is_known:  # a transform has no covariance that could say that it is not
             T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
             yield _on("/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)]))

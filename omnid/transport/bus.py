@@ -14,7 +14,7 @@ import json
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import count
 from operator import attrgetter
@@ -32,12 +32,12 @@ from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import (
     ARM,
     CLOCK,
+    COMMANDS,
     MOST_OPEN,
     PUBLISHED,
     STOP,
     Answer,
     Request,
-    command_of,
     plain_key,
     request_key,
     ros_name,
@@ -195,21 +195,20 @@ class Bus:
     def subscribe_commands(
         self,
         callback: Callable[[Request], Answer | None],
-        topics: Mapping[str, str],
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Call callback for messages on `<robot>/cmd/...` and queries that ask the same, in a thread of the bus.
+        """Call callback for messages on COMMANDS and queries that ask the same, in a thread of the bus.
 
-        It returns the answer, None where another part of the robot answers later or none is needed.
-        topics: with their types, each with a budget of its own; what exceeds it is dropped and counted.
+        It returns the answer, None where another part of the robot answers later or none is needed. Each topic has a
+        budget of its own; what exceeds it is dropped and counted.
         is_stopped: True if a stop holds, which confirms stops that come as datagrams; they are passed on as others.
         """
         self._on_command = callback
         if not self.is_unique:
             callback(Request(STOP))
         subscriber, robot = self._session.declare_subscriber, self._config.robot
-        for topic in (*sorted({*topics} - {ARM, STOP}), ARM, STOP):
-            command = command_of(topic)
+        for topic in (*sorted(COMMANDS.keys() - {ARM, STOP}), ARM, STOP):
+            command = COMMANDS[topic]
             places: list[tuple[Callable[..., Any], str]] = [(subscriber, f"{robot}/{topic}")]
             if self._config.ros2 == "rmw_zenoh":  # a key of it ends with the type of the message and the type's hash
                 places += [(subscriber, f"{self._config.ros2_domain}/{robot}/{topic}/*/*")]
@@ -221,8 +220,8 @@ class Bus:
             Poller(self._take_commands, PERIOD_S, "bus commands"),
             Poller(self._stop_listener.process, PERIOD_S, "stop datagrams"),
         ]
-        for name, schema in topics.items():
-            self._node.subscription(name, schema)
+        for name, command in COMMANDS.items():
+            self._node.subscription(name, command.schema)
 
     def answer(self, id: int, answer: Answer, *, also_before: str = "") -> None:
         """Answer a request, once, from any thread, without waiting; nothing happens where no query waits for it.
@@ -268,7 +267,7 @@ class Bus:
         ]
 
     def _queryable(self, name: str) -> Ring:
-        rate_hz = command_of(ARM).rate_hz  # as of requests
+        rate_hz = COMMANDS[ARM].rate_hz  # as of requests
         return Ring(self._session.declare_queryable, plain_key(self._config.robot, name), rate_hz)
 
     def _answer_queries(self) -> None:

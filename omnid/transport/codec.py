@@ -252,11 +252,6 @@ class PoseInMap:
     covariance: Array
 
 
-def map_pose_cdr(stamp_ns: int, T_map_base: Array, covariance: Array) -> bytes:
-    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of the base in the map, covariance in its axes."""
-    return encoded(MAP_POSE_SCHEMA, (stamp_ns, "map"), (T_map_base, np.ravel(covariance)))
-
-
 def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     """Decode a PoseWithCovarianceStamped with a finite, rigid pose."""
     message = decoded(payload, MAP_POSE_SCHEMA)
@@ -493,17 +488,6 @@ def twist_from_cdr(payload: bytes) -> TwistRecord:
     return TwistRecord(stamp_ns, frame, linear.x, angular.z, aside)
 
 
-def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
-    """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
-    return encoded(VECTOR_SCHEMA, (stamp_ns, "odom"), (velocity_mps, 0.0, heading_rad))
-
-
-def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
-    """Decode a heading command: its stamp [ns], frame, speed [m/s] and heading [rad], which need not be finite."""
-    message = decoded(payload, VECTOR_SCHEMA)
-    return stamp_of(message.header), message.header.frame_id, message.vector.x, message.vector.z
-
-
 def header_cdr(stamp_ns: int) -> bytes:
     """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
     return encoded(HEADER_SCHEMA, stamp_ns, "")
@@ -524,12 +508,6 @@ def goal_cdr(stamp_ns: int, frame: str, xy: tuple[float, float], heading_rad: fl
     return encoded(POSE_SCHEMA, (stamp_ns, frame), _planar_pose(*xy, heading_rad))
 
 
-def goal_from_cdr(payload: bytes) -> PlanarPath:
-    """Decode a PoseStamped that is finite and not tilted."""
-    message = decoded(payload, POSE_SCHEMA)
-    return _planar_path(message, [message])
-
-
 def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
     """Encode a path through positions (N, 2); its poses point along it, the last one to the given heading."""
     points = np.asarray(xy, np.float64).reshape(-1, 2)
@@ -541,16 +519,12 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
     return encoded(PATH_SCHEMA, head, poses)
 
 
-def path_from_cdr(payload: bytes, _: bytes = b"") -> PlanarPath:
-    """Decode a path of poses that are finite; the last one is not tilted."""
-    message = decoded(payload, PATH_SCHEMA)
-    if not message.poses:
+def path_from_cdr(payload: bytes, _: bytes = b"", *, schema: str = PATH_SCHEMA) -> PlanarPath:
+    """Decode a Path, or a PoseStamped, of poses that are finite; the last one is not tilted."""
+    message = decoded(payload, schema)
+    poses = [message] if schema == POSE_SCHEMA else message.poses
+    if not poses:
         raise OmnidError("a path without poses: expected one or more")
-    return _planar_path(message, message.poses)
-
-
-def _planar_path(message: Any, poses: Sequence[Any]) -> PlanarPath:
-    """Return the content of a message with a header by its poses, which are stamped."""
     # 1. The positions.
     xy = np.array([(one.pose.position.x, one.pose.position.y) for one in poses])
     if not np.isfinite(xy).all():

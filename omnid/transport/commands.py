@@ -21,7 +21,7 @@ import re
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
@@ -132,7 +132,6 @@ class CommandReceiver:
         freshness: Freshness,
         *,
         controller: DriveLink | None = None,
-        sources: Sequence[str] = (OPERATOR, PLANNER),
         is_unique: Callable[[], bool] = lambda: True,
         navigate: Callable[[requests.NavigationCommand], None] | None = None,
         save_map: Callable[[int], object] | None = None,
@@ -142,12 +141,11 @@ class CommandReceiver:
     ) -> None:
         """freshness: the rule for the times of sending.
 
-        controller: None without wheels. sources: names; the first has the short topics cmd/twist and cmd/heading, too.
-        is_unique: False while another robot has this one's name, which is then not armed. navigate: takes requests;
-        None: there is no navigation. save_map: takes the id of a request to save the map; None: it is in no file.
-        sensors: take the bytes of samples, by topic; OmnidError for others. why_not: the remedy for topics that have no
-        action. report: takes a line for the log where a refusal is another one than before. All are called from any
-        thread.
+        controller: None without wheels. is_unique: False while another robot has this one's name, which is then not
+        armed. navigate: takes requests; None: there is no navigation. save_map: takes the id of a request to save the
+        map; None: it is in no file. sensors: take the bytes of samples, by topic; OmnidError for others. why_not: the
+        remedy for topics that have no action. report: takes a line for the log where a refusal is another one than
+        before. All are called from any thread.
         """
         self._freshness, self._is_unique, self._why_not, self._report = freshness, is_unique, why_not, report
         self.wheels, self.requests, self.samples = MessageCounts(), MessageCounts(), MessageCounts()
@@ -158,9 +156,12 @@ class CommandReceiver:
             self._controller = controller
             self._actions |= {topics.ARM: self._arm, topics.STOP: self._stop}
             self._actions |= {topic: partial(self._touch, contact) for topic, contact in CONTACTS.items()}
-            for topic, (source, kind) in topics.setpoint_topics(sources).items():
-                parser = _twist_command if kind == topics.TWIST else _heading_command
-                self._actions[topic] = partial(self._drive, source, parser)
+            self._actions |= {
+                topics.TWIST: partial(self._drive, OPERATOR, _twist_command),
+                topics.HEADING: partial(self._drive, OPERATOR, _heading_command),
+                topics.PLANNER_TWIST: partial(self._drive, PLANNER, _twist_command),
+                topics.PLANNER_HEADING: partial(self._drive, PLANNER, _heading_command),
+            }
         if navigate is not None:
             self._actions |= dict.fromkeys(topics.NAVIGATION_TOPICS, partial(self._ask, navigate))
         if save_map is not None:
@@ -180,8 +181,8 @@ class CommandReceiver:
         counts = self._counts.get(request.topic, self.wheels)
         try:
             if (action := self._actions.get(request.topic)) is None:
-                raise Refused("not available", self._why_not.get(request.topic, "the sources are operator and planner"))
-            if len(request.payload) > (longest := topics.command_of(request.topic).longest):
+                raise Refused("not available", self._why_not.get(request.topic, ""))
+            if len(request.payload) > (longest := topics.COMMANDS[request.topic].longest):
                 raise Refused("too long", f"{len(request.payload)} bytes, expected at most {longest}")
             action(request, arrival_ns)
         except OmnidError as error:
@@ -273,9 +274,10 @@ def _twist_command(payload: bytes) -> tuple[int, Setpoint]:
 
 def _heading_command(payload: bytes) -> tuple[int, Setpoint]:
     """Return the stamp [ns] of a speed and a heading in odom. Raise OmnidError for anything else."""
-    stamp_ns, frame, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
-    _check(frame, "odom", velocity_mps, heading_rad)
-    return stamp_ns, Setpoint(velocity_mps, heading_rad)
+    message = codec.decoded(payload, codec.VECTOR_SCHEMA)
+    velocity_mps, heading_rad = message.vector.x, message.vector.z
+    _check(message.header.frame_id, "odom", velocity_mps, heading_rad)
+    return codec.stamp_of(message.header), Setpoint(velocity_mps, heading_rad)
 
 
 def _check(frame: str, expected: str, *values: float) -> None:
@@ -291,8 +293,7 @@ def _check(frame: str, expected: str, *values: float) -> None:
 def _navigation_request(topic: str, payload: bytes) -> tuple[requests.NavigationRequest, int]:
     """Decode a request and its stamp [ns], 0 where it has none. Raise OmnidError for anything else."""
     if topic in (topics.GOAL, topics.PATH):
-        decode = codec.goal_from_cdr if topic == topics.GOAL else codec.path_from_cdr
-        stamp_ns, name, xy, heading_rad = decode(payload)
+        stamp_ns, name, xy, heading_rad = codec.path_from_cdr(payload, schema=topics.COMMANDS[topic].schema)
         if not (abs(xy) <= FARTHEST_M).all():
             raise OmnidError(f"a position beyond {FARTHEST_M:g} m: check the sender")
         if name not in list(requests.NavigationFrame):

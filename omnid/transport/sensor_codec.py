@@ -57,7 +57,6 @@ def sample_from_cdr(payload: bytes, schema: str, stamp_ns: Callable[[int], int])
 COMPRESSED: Final = ("jpeg", "png")
 # Encoding in drivers.frame -> name in sensor_msgs/image_encodings.hpp, where that is different.
 _ROS_NAMES: Final = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
-_PIXEL_BYTES: Final = {"mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2}
 
 
 def image_topic(frame: Frame) -> str:
@@ -73,8 +72,8 @@ def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
     head, data = (stamp_ns, frame.camera), np.frombuffer(frame.data, np.uint8)
     if frame.encoding in COMPRESSED:
         return COMPRESSED_IMAGE, encoded(COMPRESSED_IMAGE, head, frame.encoding, data)
-    step = frame.step or frame.width * _PIXEL_BYTES.get(frame.encoding, 1)
     rows = frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # the colour planes follow as rows
+    step = frame.step or len(data) // rows
     name = _ROS_NAMES.get(frame.encoding, frame.encoding)
     data = data[: step * rows]
     return IMAGE, encoded(IMAGE, head, frame.height, frame.width, name, int(frame.bigendian), step, data)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -72,8 +72,10 @@ WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
 NAVIGATION_TOPICS: Final = (GOAL, PATH, NAVIGATION, ROUTE)
 SENSOR_TOPICS: Final = (WHEEL_ODOM, IMU)
-TWIST: Final = "twist"
-HEADING: Final = "heading"
+TWIST: Final = "cmd/twist"
+HEADING: Final = "cmd/heading"
+PLANNER_TWIST: Final = "cmd/planner/twist"
+PLANNER_HEADING: Final = "cmd/planner/heading"
 
 
 class Command(NamedTuple):
@@ -99,30 +101,11 @@ COMMANDS: Final = {
     **dict.fromkeys((NAVIGATION, ROUTE, MAP), _request(codec.STRING_SCHEMA)),
     WHEEL_ODOM: Command(codec.ODOMETRY_SCHEMA),
     IMU: Command(codec.IMU_SCHEMA),
+    # In base_link: linear.x m/s, angular.z rad/s; or a plain Twist, whose time of sending is attached.
+    **dict.fromkeys((TWIST, PLANNER_TWIST), Command(codec.TWIST_SCHEMA)),
+    # In odom: x the speed in m/s, z the heading in rad.
+    **dict.fromkeys((HEADING, PLANNER_HEADING), Command(codec.VECTOR_SCHEMA)),
 }
-# Of each source, as cmd/planner/twist. TwistStamped in base_link: linear.x m/s, angular.z rad/s; or a plain Twist,
-# whose time of sending is attached. Vector3Stamped in odom: x the speed in m/s, z the heading in rad.
-_SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
-
-
-def command_of(topic: str) -> Command:
-    """Return what is accepted on a topic of commands or, by its last part, of setpoints."""
-    return COMMANDS.get(topic) or Command(_SETPOINTS.get(topic.rpartition("/")[2], ""))
-
-
-def setpoint_topics(sources: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the topics of setpoints with their source and kind, TWIST or HEADING.
-
-    sources: names, of which the first has the short topics, too.
-    """
-    short, kinds = sources[0] if sources else "", list(_SETPOINTS)
-    named = {f"cmd/{source}/{kind}": (source, kind) for source in sources for kind in kinds}
-    return {f"cmd/{kind}": (short, kind) for kind in kinds} | named
-
-
-def command_topics(sources: Sequence[str]) -> dict[str, str]:
-    """Return the topics of commands with their types; sources: as of setpoint_topics."""
-    return {topic: command_of(topic).schema for topic in (*setpoint_topics(sources), *COMMANDS)}
 
 
 def request_key(topic: str) -> str:

@@ -14,10 +14,9 @@ import pytest
 from ruamel.yaml import YAML
 
 import omnid
-from omnid.cli import COMMANDS, command_at
+from omnid import cli
 from omnid.config import Config
-from omnid.core.control.command_sources import SOURCES
-from omnid.transport.topics import PUBLISHED, command_topics, ros_name
+from omnid.transport.topics import COMMANDS, PUBLISHED, ros_name
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -63,11 +62,11 @@ def commands() -> Iterator[tuple[str, list[str]]]:
 
 def unknown_words(words: list[str]) -> list[str]:
     """Return the command, if there is no such one, or its options that do not exist."""
-    name = next((name for name in (" ".join(words[:2]), words[0]) if name in COMMANDS), None)
+    name = next((name for name in (" ".join(words[:2]), words[0]) if name in cli.COMMANDS), None)
     if name is None:
         return words[:1]
     known = argparse.ArgumentParser()
-    command_at(COMMANDS[name]).add_to(known)
+    cli.command_at(cli.COMMANDS[name]).add_to(known)
     options = {option for action in known._actions for option in action.option_strings}
     return [word for word in words if re.fullmatch("--[a-z-]+", word) and word not in options]
 
@@ -127,7 +126,7 @@ def test_images_are_small() -> None:
 def test_nav2_uses_topics_that_exist() -> None:
     folder = DOCS / "ros2"
     text = "".join((folder / name).read_text("utf-8") for name in ("nav2.launch.py", "nav2_params.yaml"))
-    known = {ros_name("omnid", name) for name in (*PUBLISHED, *command_topics(SOURCES))}
+    known = {ros_name("omnid", name) for name in (*PUBLISHED, *COMMANDS)}
     used = set(re.findall(r"/omnid/[\w/]+", text))
     assert {"/omnid/scan", "/omnid/map", "/omnid/odom", "/omnid/cmd/planner/twist"} <= used <= known
     compile((folder / "nav2.launch.py").read_text("utf-8"), "nav2.launch.py", "exec")

@@ -37,7 +37,7 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import IMU_SCHEMA, PoseAttachment
 from omnid.transport.commands import Freshness
 from omnid.transport.sensor_codec import sample_from_cdr
-from omnid.transport.topics import Request, command_topics
+from omnid.transport.topics import Request
 from tests.conftest import PAIRS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session
 from tests.ply import read_ply
@@ -270,14 +270,15 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
         if request.topic == "cmd/arm":
             bus.answer(request.id, Answer(True, "armed"))
         elif request.topic == "cmd/heading":
-            _, _, velocity_mps, heading_rad = codec.heading_from_cdr(request.payload)
+            vector = codec.decoded(request.payload, codec.VECTOR_SCHEMA).vector
+            velocity_mps, heading_rad = vector.x, vector.z
             state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
             state["y"] += 0.1 * velocity_mps * math.sin(heading_rad)
         elif request.topic == "cmd/twist":
             stops.append(request.topic)
 
     with robot() as (bus, endpoint):
-        bus.subscribe_commands(execute, command_topics(("operator",)))
+        bus.subscribe_commands(execute)
         code = docstring_code(Driver.__doc__).replace('Robot("omnid")', f'Robot("omnid", connect=("{endpoint}",))')
         with script(f"print('ready', flush=True)\n{code}") as process:
 
@@ -302,9 +303,10 @@ def test_sends_commands() -> None:
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
         bus.serve("time", freshness.own_time)
         driver = connection.driver()
-        assert not driver.connected
-        bus.subscribe_commands(received.append, command_topics(("operator", "planner")))
-        wait_until(lambda: driver.connected)
+        with pytest.raises(OmnidError, match="receives commands"):
+            driver.require_connected()
+        bus.subscribe_commands(received.append)
+        driver.require_connected()
         driver.twist(0.5, -0.25)
         driver.heading(0.75, 1.5)
         wait_until(lambda: len(received) == 2)
@@ -325,7 +327,8 @@ def test_sends_commands() -> None:
     assert [request.topic for request in received] == topics
     for request in (twist, planned):
         assert codec.twist_from_cdr(request.payload)[1:4] == ("base_link", 0.5, -0.25)
-    assert codec.heading_from_cdr(heading.payload)[1:] == ("odom", 0.75, 1.5)
+    sent = codec.decoded(heading.payload, codec.VECTOR_SCHEMA)
+    assert (sent.header.frame_id, sent.vector.x, sent.vector.z) == ("odom", 0.75, 1.5)
     assert before_ns <= arm.sent_ns <= time.time_ns()
     senders = {request.sender for request in (twist, heading, stop, planned)}
     assert len(senders) == 1 and other_stop.sender not in senders and len(other_stop.sender) >= 16

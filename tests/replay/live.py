@@ -150,7 +150,9 @@ class Operator:
         while not self._leaving.wait(COMMAND_PERIOD_S):
             wish = self._wish
             if wish is not None:
-                self.send("cmd/heading", codec.heading_cdr(time.time_ns(), *wish))
+                self.send(
+                    "cmd/heading", codec.encoded(codec.VECTOR_SCHEMA, (time.time_ns(), "odom"), (wish[0], 0.0, wish[1]))
+                )
 
     def _pose(self, sample: zenoh.Sample) -> None:
         self.poses.append(codec.decode_pose(sample.payload.to_bytes()))

@@ -27,7 +27,7 @@ def command(rng: random.Random, topics: Sequence[str], age_s: float) -> tuple[st
     stamp_ns = time.time_ns() - round(age_s * 1e9)
     payload = rng.choice(
         (
-            codec.heading_cdr(stamp_ns, rng.uniform(-3, 3), rng.uniform(-9, 9)),
+            codec.encoded(codec.VECTOR_SCHEMA, (stamp_ns, "odom"), (rng.uniform(-3, 3), 0.0, rng.uniform(-9, 9))),
             codec.twist_stamped_cdr(stamp_ns, "base_link", rng.uniform(-3, 3), rng.uniform(-9, 9)),
             codec.header_cdr(stamp_ns),
         )

@@ -30,7 +30,7 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment, string_from_cdr
 from omnid.transport.status_names import BUS, DISARMED_BY_STOP, NAVIGATION, WHEELS, Key
 from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC
-from omnid.transport.topics import Answer, Request, command_topics
+from omnid.transport.topics import Answer, Request
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, script
 from tests.waiting import wait_until
 
@@ -255,7 +255,7 @@ def test_a_drive_is_cancelled_when_its_command_is_ended(
                 bus.answer(request.id, Answer(True, "it drives"))
             asked.append(request.topic)
 
-        bus.subscribe_commands(take, command_topics(("operator",)))
+        bus.subscribe_commands(take)
         command = [sys.executable, "-c", HEARS_ALL, *words, "--connect", endpoint]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             wait_until(lambda: len(asked) == 1)

@@ -299,7 +299,9 @@ def odom(
 
 def map_pose(pose: int, T_map_odom: np.ndarray) -> Entry:
     """A pose in the map."""
-    payload = codec.map_pose_cdr(at(pose), T_map_odom @ T_odom_base(pose), 1e-4 * np.eye(6))
+    payload = codec.encoded(
+        codec.MAP_POSE_SCHEMA, (at(pose), "map"), (T_map_odom @ T_odom_base(pose), 1e-4 * np.eye(6).ravel())
+    )
     return at(pose), "/omnid/map_pose", codec.MAP_POSE_SCHEMA, payload
 
 

@@ -16,7 +16,7 @@ from calib import se3
 from omnid.client import Robot
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.topics import Request, command_topics
+from omnid.transport.topics import Request
 from tests.ports import free_port
 
 DEADLINE_S = 30.0
@@ -73,7 +73,7 @@ def robot() -> Iterator[tuple[Bus, Robot, list[Request]]]:
     """Yield a bus that keeps what comes, and a program on it."""
     endpoint, received = free_endpoint(), list[Request]()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as program:
-        bus.subscribe_commands(received.append, command_topics(("operator",)))
+        bus.subscribe_commands(received.append)
         yield bus, program, received
 
 

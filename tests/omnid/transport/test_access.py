@@ -19,7 +19,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import OK
 from omnid.transport.status_names import BUS, entry
-from omnid.transport.topics import Request, command_topics
+from omnid.transport.topics import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session
 from tests.waiting import wait_until
 
@@ -103,7 +103,7 @@ def commands_to(config: BusConfig) -> Iterator[tuple[Bus, list[str]]]:
             received.append(request.topic)
             bus.answer(request.id, Answer(True, "armed"))
 
-        bus.subscribe_commands(take, command_topics(("operator", "planner")))
+        bus.subscribe_commands(take)
         yield bus, received
 
 

@@ -27,7 +27,7 @@ from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
 from omnid.transport.session import open_client, open_session, zenoh_config
 from omnid.transport.status_names import BUS, entry
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
-from omnid.transport.topics import COMMANDS, PUBLISHED, Request, command_of, command_topics, request_key
+from omnid.transport.topics import COMMANDS, PUBLISHED, Request, request_key
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, robot, script, session
 from tests.waiting import wait_until
 
@@ -62,7 +62,7 @@ def test_the_default_is_this_machine_only() -> None:
     assert not setting(config, "scouting/multicast/enabled") and not setting(config, "scouting/gossip/enabled")
     assert setting(config, "access_control")["default_permission"] == "deny"
     limited = setting(BusConfig(robot="rover", ros2_domain=3), "low_pass_filter")[0]["key_exprs"]
-    topics = command_topics(("planner",)).keys() - {"cmd/path"}
+    topics = COMMANDS.keys() - {"cmd/path"}
     keys = [f"rover/{topic}" for topic in topics] + [f"3/rover/{topic}/type/hash" for topic in topics]
     keys += [f"rover/{request_key(topic)}" for topic in COMMANDS if COMMANDS[topic].is_request and topic != "cmd/path"]
     assert all(any(zenoh.KeyExpr(bound).includes(zenoh.KeyExpr(key)) for bound in limited) for key in keys)
@@ -256,7 +256,7 @@ def test_receives_a_twist_from_ros() -> None:
     endpoint, received = free_endpoint(), []
     key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
-        bus.subscribe_commands(received.append, command_topics(("planner",)))
+        bus.subscribe_commands(received.append)
         with session(mode="client", connect__endpoints=[endpoint]) as node:
             message, gid = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1), bytes(range(16))
             attachment = ros2.attachment(1, 5, gid)
@@ -279,7 +279,7 @@ def test_a_query_for_several_keys_is_no_request() -> None:
 def test_of_a_stop_and_a_request_to_arm_in_one_pass_the_stop_wins() -> None:
     with robot() as (bus, program, received):
         driver = program.driver()
-        wait_until(lambda: driver.connected)
+        driver.require_connected()
         bus._pollers[-2].close()  # the passes are made here
         stop, ask = program._session.put, program._session.get
         stop("omnid/cmd/stop", b"")
@@ -329,7 +329,7 @@ def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> N
         def count(request: Request) -> None:
             commands[request.topic] += 1
 
-        bus.subscribe_commands(count, command_topics(("operator",)))
+        bus.subscribe_commands(count)
         with script(FLOOD, endpoint, f"omnid/{key}"), Robot(connect=(endpoint,)) as operator:
             driver = operator.driver()
             wait_until(lambda: entry(BUS, bus.stats()).level == WARN)
@@ -338,7 +338,7 @@ def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> N
             wait_until(lambda: driver.stop() is None and commands["cmd/stop"] > 0)
             wait_until(lambda: driver.twist(0.1, 0.0) is None and commands["cmd/twist"] > 0)
             time.sleep(1.0)
-            rate_hz = command_of(topic).rate_hz
+            rate_hz = COMMANDS[topic].rate_hz
             assert commands[topic] - before <= 2 * max(4, rate_hz / 4) + rate_hz * (time.monotonic() - begin_s)
 
 

@@ -26,7 +26,7 @@ from omnid.transport import codec
 from omnid.transport.codec import BOOL_SCHEMA, encoded, goal_cdr, path_cdr, string_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
 from omnid.transport.sensor_codec import gyro_cdr, sample_from_cdr, wheel_cdr
-from omnid.transport.topics import IMU, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request, command_of
+from omnid.transport.topics import COMMANDS, IMU, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request
 from tests.omnid.transport.bus_fixtures import damaged
 from tests.set_clock import SetClock
 
@@ -105,7 +105,7 @@ def plain_twist(velocity_mps: float = 0.3, rate_radps: float = -0.2) -> bytes:
 
 
 def heading(velocity_mps: float = 0.4, heading_rad: float = 1.5) -> bytes:
-    return codec.heading_cdr(now_ns(), velocity_mps, heading_rad)
+    return codec.encoded(codec.VECTOR_SCHEMA, (now_ns(), "odom"), (velocity_mps, 0.0, heading_rad))
 
 
 def arm(later_s: float = 0.0) -> bytes:
@@ -314,7 +314,7 @@ def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands) -> None:
     """None raises, each is counted, and numbers of payloads that are still valid are finite and in range."""
     rng = random.Random(1)
     for _ in range(1000):
-        key, good = rng.choice((("cmd/twist", twist()), ("cmd/heading", codec.heading_cdr(now_ns(), 0.1, 0.2))))
+        key, good = rng.choice((("cmd/twist", twist()), ("cmd/heading", heading(0.1, 0.2))))
         accepted.receive(key, worse(rng, good))
     refused = accepted.counts.refused
     assert accepted.counts.accepted + sum(refused.values()) == 1000 and accepted.counts.accepted < 300
@@ -489,7 +489,7 @@ def test_damaged_messages_never_raise_and_lead_to_finite_goals() -> None:
 
 def receiver(taken: list[MotionSample], lines: list[str], *sensors: str) -> CommandReceiver:
     def take(topic: str, payload: bytes) -> None:
-        taken.append(sample_from_cdr(payload, command_of(topic).schema, stamp_of))
+        taken.append(sample_from_cdr(payload, COMMANDS[topic].schema, stamp_of))
 
     used = {topic: partial(take, topic) for topic in sensors or SENSOR_TOPICS}
     return CommandReceiver(

@@ -24,7 +24,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment, scan_cdr, string_from_cdr
 from omnid.transport.status_names import CALIBRATION, NAVIGATION, WHEELS, Key
-from omnid.transport.topics import Answer, Request, command_topics
+from omnid.transport.topics import Answer, Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.web.servers import WebServer, served
 from tests.replay.live import started
@@ -59,7 +59,7 @@ class Navigator:
 
     def __init__(self, bus: Bus) -> None:
         self._bus, self.asked, self.state = bus, list[str](), "driving"
-        bus.subscribe_commands(self._take, command_topics(("operator",)))
+        bus.subscribe_commands(self._take)
 
     def _take(self, request: Request) -> None:
         text = string_from_cdr(request.payload)

@@ -36,7 +36,7 @@ from omnid.transport.codec import (
 )
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
-from omnid.transport.topics import Answer, Request, command_topics
+from omnid.transport.topics import Answer, Request
 from omnid.web.feed import RobotFeed, scan_news, state_news
 from omnid.web.server import STATIC, metrics
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
@@ -63,7 +63,7 @@ class Rover:
         self.topics, self.twists = list[str](), list[tuple[float, float]]()
         self.texts, self.is_stopped, self.is_granted = list[str](), False, True
         bus.serve("config", "[controller.limits]\nvelocity_mps = 0.7\nyaw_rate_radps = 1.5\n")
-        bus.subscribe_commands(self._take, command_topics(("operator",)), lambda: self.is_stopped)
+        bus.subscribe_commands(self._take, lambda: self.is_stopped)
 
     def _take(self, request: Request) -> None:
         self.topics.append(request.topic)
@@ -97,7 +97,7 @@ def page(rover: Rover) -> Iterator[RobotPage]:
     feed = rover.feed()
     with Robot(settings=feed.bus) as connection:
         feed.robot, feed.link = connection, ""
-        wait_until(lambda: connection.driver().connected)
+        connection.driver().require_connected()
         yield RobotPage(feed)
 
 
@@ -421,7 +421,9 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
     }
     add_pose(feed, 0)
     add_pose(feed, 4)
-    feed.state.put("map_pose", codec.map_pose_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
+    feed.state.put(
+        "map_pose", codec.encoded(codec.MAP_POSE_SCHEMA, (10**9 + 4, "map"), (np.eye(4), np.eye(6).ravel())), b""
+    )
     feed.process_inbox()
     for topic, payload in large.items():
         feed.process_large(ReceivedMessage(topic, payload, b"", 0.0))
