@@ -10,15 +10,13 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.log_reader import BY_NAME, LogCameras, LogReader
 
-MAX_LOG_BYTES: Final = 1 << 30
-MAX_DELAY_NS: Final = 100_000_000  # a frame later than that is dropped, as by a camera whose buffers are full
 TimedFrames: TypeAlias = tuple[tuple[int, Frame], ...]  # time since the log's first frame [ns], frame
 
 
@@ -32,19 +30,12 @@ class LogPlayback:
     def __init__(self, log: Path, cameras: LogCameras = BY_NAME, *, pace: float = 1.0, once: bool = False) -> None:
         """Load the images; pace: speed relative to the recording. once: play once, forwards.
 
-        Raise DriverError for a pace that is not above 0, for fewer than two images of a camera, and for more than
-        MAX_LOG_BYTES.
+        Raise DriverError for a pace that is not above 0, and for fewer than two images of a camera.
         """
         if not 0 < pace < math.inf:
             raise DriverError(f"the pace of a log is {pace:g}; give a number above 0; 2 is twice as fast as recorded")
-        frames, left_bytes = list[Frame](), MAX_LOG_BYTES
         with closing(LogReader(log, cameras)) as reader:
-            for frame in reader.frames():
-                frames.append(frame)
-                left_bytes -= len(frame.data)  # LogReader delivers bytes
-                if left_bytes < 0:
-                    most = MAX_LOG_BYTES >> 20
-                    raise DriverError(f"{log}: more than {most} MiB of images: cut the log into shorter ones")
+            frames = list(reader.frames())
         self.frames: dict[Camera, TimedFrames] = {
             camera: tuple((frame.stamp_ns - frames[0].stamp_ns, frame) for frame in frames if frame.camera == camera)
             for camera in CAMERAS
@@ -94,14 +85,11 @@ class LogCamera:
         self.state = CameraState(mode="a recorded log")
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the frames when they are due, until closed; those that are not read in time are dropped and counted."""
+        """Yield the frames when they are due, until closed."""
         for seq, (stamp_ns, frame) in enumerate(self._playback.due(self._camera, self._closed)):
-            if time.monotonic_ns() <= stamp_ns + MAX_DELAY_NS:
-                self.state.status = "streaming"
-                self.state.frames += 1
-                yield replace(frame, seq=seq, stamp_ns=stamp_ns)
-            else:
-                self.state.drops += 1
+            self.state.status = "streaming"
+            self.state.frames += 1
+            yield replace(frame, seq=seq, stamp_ns=stamp_ns)
         self.state.status = "closed"
 
     def close(self) -> None:

@@ -188,7 +188,9 @@ def follow_request(fd: int, settings: V4l2Settings, exposure: CameraExposure, st
 def _set_exposure(fd: int, setting: ExposureSetting) -> None:
     """Switch the automatic modes off, where the device has them, and set the values."""
     offered = list_controls(fd)
-    values = [(ControlId.AUTO_EXPOSURE, ExposureMode.MANUAL)] if ControlId.AUTO_EXPOSURE in offered else []
+    values: list[tuple[int, int]] = (
+        [(ControlId.AUTO_EXPOSURE, ExposureMode.MANUAL)] if ControlId.AUTO_EXPOSURE in offered else []
+    )
     values += [(ControlId.AUTO_GAIN, 0)] if ControlId.AUTO_GAIN in offered and setting.gain is not None else []
     values.append((ControlId.EXPOSURE, round(setting.exposure_us / EXPOSURE_UNIT_US)))
     values += [(ControlId.GAIN, setting.gain)] if setting.gain is not None else []

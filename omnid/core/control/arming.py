@@ -21,10 +21,10 @@ MOTOR: Final = "motor"
 
 
 class ContactState(NamedTuple):
-    """State of the sensors of one origin; the count shows a contact that has begun and ended between two messages."""
+    """State of the sensors of one origin; `begun` shows a contact that has begun and ended between two messages."""
 
     holding: frozenset[str] = frozenset()  # contacts that hold now: BUMPER, CLIFF
-    count: int = 0  # contacts so far
+    begun: int = 0  # contacts so far
     newest: str = ""  # the last one that has begun
 
     def after(self, contact: str, *, holds: bool) -> ContactState:
@@ -32,7 +32,7 @@ class ContactState(NamedTuple):
         if not holds:
             return self._replace(holding=self.holding - {contact})
         begins = contact not in self.holding
-        return ContactState(self.holding | {contact}, self.count + begins, contact if begins else self.newest)
+        return ContactState(self.holding | {contact}, self.begun + begins, contact if begins else self.newest)
 
 
 NO_CONTACT: Final = ContactState()
@@ -48,7 +48,7 @@ class Contacts:
     def update(self, origin: str, state: ContactState) -> None:
         """Replace the state of an origin."""
         before, self._states[origin] = self._states.get(origin, NO_CONTACT), state
-        self._begun |= {state.newest} if state.count > before.count else set()
+        self._begun |= {state.newest} if state.begun > before.begun else set()
 
     def take(self) -> set[str]:
         """Return the contacts that hold, or have begun since the last call."""
