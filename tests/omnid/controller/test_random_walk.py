@@ -283,14 +283,15 @@ class Walk:
             for k in range(middle - 5, middle + 6):
                 ranges[k] = rng.uniform(nearest_m, 1.2)
         if kind == "unknown":
-            ranges[rng.randrange(200) : 300] = [math.nan] * 100
+            first = rng.randrange(200)
+            ranges[first : first + 100] = [math.nan] * 100
         if kind == "random":
             ranges = [rng.choice((math.inf, math.nan, rng.uniform(0.1, 3.0))) for _ in range(360)]
         moving = (MovingPoint(rng.uniform(0.4, 2), rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-1, 1), 0.2),)
         age_s = rng.uniform(0.0, 0.15) if self.chance(0.99, 0.9) else rng.uniform(-1, 2)
         scan = ControllerScan(
             self.now_ns - round(age_s * 1e9),
-            tuple(ranges[:360]),
+            tuple(ranges),
             (rng.uniform(0, 2),) * 360,
             moving if kind == "person" else (),
         )
