@@ -167,7 +167,7 @@ def test_a_stop_gets_through_when_all_sessions_are_taken(tmp_path: Path) -> None
             commands.append(request.topic)
             stopped[0] = request.topic == "cmd/stop"
 
-        bus.subscribe_commands(execute, {}, lambda: stopped[0])
+        bus.subscribe_commands(execute, lambda: stopped[0])
         with script(CROWD, endpoint):
             assert stop(BusConfig(connect=(endpoint,)))
     assert set(commands) == {"cmd/stop"}
@@ -185,7 +185,7 @@ def test_a_status_from_before_the_stop_does_not_confirm_it() -> None:
             if len(stops) == 3:
                 bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [STOPPED]))
 
-        bus.subscribe_commands(execute, {})
+        bus.subscribe_commands(execute)
         assert bus._stop_listener is not None
         bus._stop_listener.close()
         assert stop(BusConfig(connect=(endpoint,)))

@@ -194,7 +194,7 @@ def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
         second = started()
         wait_until(lambda: len(warnings) == 2)
         assert "change bus.robot" in warnings[0] and "\n" not in warnings[0]
-        second.subscribe_commands(lambda request: commands.append(request.topic), {})
+        second.subscribe_commands(lambda request: commands.append(request.topic))
         assert entry(BUS, second.stats()).level == ERROR and not second.is_unique and commands == ["cmd/stop"]
         assert (
             entry(BUS, second.stats()).values["same_name"] == "1" and entry(BUS, started("other").stats()).level == OK
@@ -358,7 +358,7 @@ def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
         commands: list[str] = []
-        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
+        bus.subscribe_commands(lambda request: commands.append(request.topic))
         with contextlib.closing(StopSender("rover", (endpoint,))) as sender:
             wait_until(lambda: sender.ask(0.1) == ASKED)
         assert commands
@@ -375,7 +375,7 @@ def test_nothing_else_stops_and_no_answer_is_longer_than_its_request() -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
     ):
         commands: list[str] = []
-        bus.subscribe_commands(lambda request: commands.append(request.topic), {}, lambda: True)
+        bus.subscribe_commands(lambda request: commands.append(request.topic), lambda: True)
         good = b"omnid stop 1 0123456789abcdef omnid" + b" " * 8
         for data in (b"", b"\xff" * 2000, good[:-12], good.upper(), good + b"\n", good.replace(b"omnid ", b"omni ")):
             stranger.sendto(data, (host, port))

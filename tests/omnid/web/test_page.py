@@ -366,7 +366,7 @@ def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: P
 def test_another_site_in_the_same_browser_can_do_nothing(browser: Any) -> None:
     endpoint, commands = free_endpoint(), list[str]()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server:
-        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
+        bus.subscribe_commands(lambda request: commands.append(request.topic))
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:

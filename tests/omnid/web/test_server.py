@@ -124,7 +124,7 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
 @pytest.mark.hazard("H46")
 def test_a_stop_is_repeated_until_the_status_confirms_it(server: WebServer, bus: Bus) -> None:
     received, is_stopped = list[str](), [False]
-    bus.subscribe_commands(lambda request: received.append(request.topic), {}, lambda: is_stopped[0])
+    bus.subscribe_commands(lambda request: received.append(request.topic), lambda: is_stopped[0])
     with ThreadPoolExecutor(2) as threads:
         answers = [threads.submit(server.post, "/stop") for _ in range(2)]
         wait_until(lambda: received.count("cmd/stop") >= 5)
@@ -173,7 +173,7 @@ def test_hostile_messages_of_the_robot_are_shown_as_text(server: WebServer, bus:
 def test_two_thousand_silent_connections_keep_no_stop_out(server: WebServer, bus: Bus, first: bytes) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 4096)), hard))
-    bus.subscribe_commands(lambda _: None, {}, lambda: True)
+    bus.subscribe_commands(lambda _: None, lambda: True)
     with ExitStack() as crowd:
         for _ in range(2000):
             silent = crowd.enter_context(socket.create_connection(("127.0.0.1", server.port)))
