@@ -1,4 +1,12 @@
-"""Driver of a motor controller on a serial port, for any protocol."""
+"""Driver of a motor controller on a serial port, for any protocol; the protocols by name (motor.protocol).
+
+Another package adds a protocol by an entry point, whose name is the protocol's:
+
+    [project.entry-points."omnid.motor_protocols"]
+    sabertooth = "my_package:Sabertooth"
+
+The object is called with a DifferentialDrive and returns a MotorProtocol.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +17,11 @@ import math
 import os
 import termios
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from enum import Enum, auto
-from typing import Final
+from importlib.metadata import entry_points
+from typing import Final, TypeAlias
 
 import serial  # type: ignore[import-untyped]
 
@@ -22,6 +31,9 @@ from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
 from drivers.motors.protocols.motor_protocol import MotorProtocol, NoReplyError, T, Transaction
+from drivers.motors.protocols.odrive_ascii import ODriveAscii
+from drivers.motors.protocols.roboteq import Roboteq
+from drivers.motors.protocols.vesc import Vesc
 
 SET_UP_S: Final = 0.2  # time for the answer to the setting-up: an ODrive needs 0.1 s
 POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
@@ -293,3 +305,31 @@ def _opened(port: str, baud: int) -> serial.Serial:
 def _clock_s() -> float:
     """Return the time with that in which the host was suspended: a controller's watchdog expires meanwhile."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+GROUP: Final = "omnid.motor_protocols"
+ProtocolFactory: TypeAlias = Callable[[DifferentialDrive], MotorProtocol]
+PROTOCOLS: Final[Mapping[str, ProtocolFactory]] = {
+    "line": LineProtocol,
+    "roboteq": Roboteq,
+    "odrive_ascii": ODriveAscii,
+    "vesc": Vesc,
+}
+
+
+def motor_protocol(name: str) -> ProtocolFactory:
+    """Return the protocol of this name, of omnid or of an installed package; raise DriverError where there is none."""
+    if name in PROTOCOLS:
+        return PROTOCOLS[name]
+    installed = entry_points(group=GROUP)
+    if name not in installed.names:
+        known = ", ".join([*PROTOCOLS, *sorted(installed.names - PROTOCOLS.keys())])
+        raise DriverError(
+            f"motor.protocol {name!r} is not known: expected one of {known}; "
+            f"other packages add protocols by the entry point group {GROUP!r}"
+        )
+    try:
+        factory: ProtocolFactory = installed[name].load()
+    except (ImportError, AttributeError) as error:
+        raise DriverError(f"motor.protocol {name!r}: its package cannot be loaded: {error}") from error
+    return factory

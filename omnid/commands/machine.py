@@ -19,7 +19,7 @@ from drivers.cameras.v4l2_controls import V4l2Settings
 from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
 from drivers.frame import CAMERAS as SIDES
 from drivers.frame import Camera, gray
-from drivers.motors.protocols.protocol_registry import motor_protocol
+from drivers.motors.serial_motor import motor_protocol
 from omnid.calibration import snapshot
 from omnid.calibration.images import Image
 from omnid.commands import options

@@ -34,7 +34,7 @@ from omnid.runs.session import attached_rig
 from omnid.simulation.demonstration import demonstrate
 from omnid.simulation.paced_robot import PacedRobot
 from omnid.simulation.robot import make_robot
-from omnid.simulation.world_file import load_world
+from omnid.simulation.world import load_world
 from omnid.sinks.files import check_outputs, write_trajectory
 
 

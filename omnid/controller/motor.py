@@ -47,8 +47,7 @@ def open_motor(config: MotorSettings, closing: ExitStack, *, waits: bool = True)
     DriverError for a watchdog so short that one or two late ticks would let it expire.
     """
     # Settings are read where no device is opened, so that only this function loads the drivers.
-    from drivers.motors.protocols.protocol_registry import motor_protocol
-    from drivers.motors.serial_motor import SerialMotor
+    from drivers.motors.serial_motor import SerialMotor, motor_protocol
     from drivers.motors.simulated_motor import SimulatedMotor
 
     least_ms = WATCHDOG_TICKS * 1000 / config.rate_hz

@@ -20,7 +20,7 @@ from calib.rig_file import read_rig
 from drivers.cameras.v4l2_controls import V4l2Settings
 from drivers.cameras.v4l2_device import CaptureDevice
 from drivers.errors import DriverError
-from drivers.motors.protocols.protocol_registry import motor_protocol
+from drivers.motors.serial_motor import motor_protocol
 from omnid.config import RecordConfig
 from omnid.controller.motor import SIMULATED, MotorSettings
 from omnid.engine.process import LOCK_ADVICE, PRIORITY_ADVICE, highest_priority, may_lock

@@ -20,8 +20,7 @@ from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, draw_ends, draw_pl
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, simulate
 from omnid.simulation.robot import make_robot
-from omnid.simulation.world import cross_track_m
-from omnid.simulation.world_file import load_world
+from omnid.simulation.world import cross_track_m, load_world
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]

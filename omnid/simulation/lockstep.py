@@ -20,8 +20,7 @@ from drivers.frame import Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.ipc import ControllerState
-from omnid.core.control.arming import ArmRequest
-from omnid.core.control.command_sources import PLANNER, TimedSetpoint
+from omnid.core.control.arming import PLANNER, ArmRequest, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
 from omnid.core.nanoseconds import NS_PER_S

@@ -21,8 +21,7 @@ from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
 from omnid.controller.ipc import TickReport
 from omnid.controller.link import ControllerStatistics, DriveLink
-from omnid.core.control.arming import NO_CONTACT, ArmRequest
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.arming import NO_CONTACT, ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.graph import Stream, nothing

@@ -31,9 +31,8 @@ from drivers.motors.simulated_motor import MotionLimits, Pose, SimulatedMotor
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.ipc import LONGEST_RAMP_S, TickReport
-from omnid.core.control.arming import ArmRequest, ContactState
+from omnid.core.control.arming import ArmRequest, ContactState, TimedSetpoint
 from omnid.core.control.collision_monitor import ControllerScan
-from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.simulation.rendering.ray_caster import render_grey

@@ -18,7 +18,7 @@ from calib import se3
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.controller.link import ControllerLink, DriveLink
-from omnid.core.control.command_sources import PLANNER, TimedSetpoint
+from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings, ControlOutput
 from omnid.core.control.heading_controller import STOP, Setpoint
 from omnid.core.frames import of_base

@@ -28,8 +28,7 @@ from types import MappingProxyType
 from typing import Final, TypeAlias
 
 from omnid.controller.link import DriveLink
-from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
-from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
+from omnid.core.control.arming import OLDER_THAN_STOP, OPERATOR, PLANNER, ArmRequest, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import BUMPER, CLIFF
 from omnid.core.nanoseconds import S_PER_NS

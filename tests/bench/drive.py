@@ -32,8 +32,7 @@ from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.rendering.surfaces import poster
 from omnid.simulation.robot import START_NS, make_robot
-from omnid.simulation.world import World, cross_track_m
-from omnid.simulation.world_file import load_world
+from omnid.simulation.world import World, cross_track_m, load_world
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation.disturbed import Fault, Slip, disturbed, simulate

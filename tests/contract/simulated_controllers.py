@@ -21,7 +21,6 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import BUMPER, CLIFF, SEQ_COUNT, decode, encode
 from drivers.motors.protocols.motor_protocol import Framer, T, TextFramer, Transaction
 from drivers.motors.protocols.odrive_ascii import CLOSED_LOOP, WATCHDOG_EXPIRED, with_checksum
-from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.protocols.roboteq import MAX_RPM
 from drivers.motors.protocols.vesc import (
     FORWARD_CAN,
@@ -31,7 +30,7 @@ from drivers.motors.protocols.vesc import (
     PacketFramer,
     packet,
 )
-from drivers.motors.serial_motor import SerialMotor
+from drivers.motors.serial_motor import PROTOCOLS, SerialMotor
 from drivers.motors.simulated_motor import LEFT, RIGHT, SIDES, STEP_S, SimulatedBase
 
 

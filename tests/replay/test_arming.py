@@ -17,7 +17,7 @@ import pytest
 from mcap.reader import make_reader
 
 from omnid.client import Robot
-from omnid.core.control.command_sources import LOWER_PRIORITY, OPERATOR, OTHER_SENDER, PLANNER
+from omnid.core.control.arming import LOWER_PRIORITY, OPERATOR, OTHER_SENDER, PLANNER
 from omnid.core.control.safety_rules import COMMAND_STALE, FAILED
 from omnid.transport.status_names import STOPPED_PREFIX
 from tests.ports import free_port

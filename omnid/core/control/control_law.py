@@ -13,9 +13,8 @@ from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 from msgspec import Meta
 
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest, Contacts
+from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest, CommandSelector, Contacts, TimedSetpoint
 from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan
-from omnid.core.control.command_sources import CommandSelector, TimedSetpoint
 from omnid.core.control.heading_controller import (
     JUMP_RAD,
     LONGEST_TICK_S,

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative
+from omnid.core.control.arming import PLANNER
 from omnid.core.control.collision_monitor import CollisionSettings
-from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.follower import BRAKE_SHARE, STAND, Follower, Following

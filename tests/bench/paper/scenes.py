@@ -18,7 +18,7 @@ from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.core.types.panorama import Panoramas
 from omnid.simulation.rendering.surfaces import CEILING_M, PAINTERS, Rectangle, Scene
-from omnid.simulation.world_file import load_world
+from omnid.simulation.world import load_world
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise

@@ -12,14 +12,14 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
-from drivers.motors.protocols import protocol_registry
+from drivers.motors import serial_motor
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol, crc16, decode
 from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
 from drivers.motors.protocols.odrive_ascii import ODriveAscii, with_checksum
-from drivers.motors.protocols.protocol_registry import GROUP, motor_protocol
 from drivers.motors.protocols.roboteq import Roboteq
 from drivers.motors.protocols.vesc import MASK, MAX_ERPM, Vesc, packet
+from drivers.motors.serial_motor import GROUP, motor_protocol
 
 # 10 turns of a motor a metre: 600 rpm, or 4,200 electrical ones, at 1 m/s.
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, gear=10.0, max_wheel_mps=2.0, can_id=9)
@@ -98,7 +98,7 @@ def test_a_name_leads_to_a_protocol_of_omnid_or_of_an_installed_package(monkeypa
             EntryPoint("missing", "no_such_package:Protocol", GROUP),
         ]
     )
-    monkeypatch.setattr(protocol_registry, "entry_points", lambda group: installed.select(group=group))
+    monkeypatch.setattr(serial_motor, "entry_points", lambda group: installed.select(group=group))
     assert motor_protocol("line") is LineProtocol and motor_protocol("another") is LineProtocol
     with pytest.raises(DriverError, match="expected one of line, roboteq, odrive_ascii, vesc, another, missing;"):
         motor_protocol("waveshare_json")

@@ -10,8 +10,7 @@ from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from omnid.controller.controller import Controller
 from omnid.controller.link import ControllerStatistics
-from omnid.core.control.arming import AUTOMATIC, ArmRequest
-from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
+from omnid.core.control.arming import AUTOMATIC, OPERATOR, ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.motion_monitor import AGREE, Conflict, TrustSettings

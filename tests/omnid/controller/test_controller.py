@@ -16,8 +16,7 @@ from drivers.motors.serial_motor import LateReplyError
 from drivers.motors.simulated_motor import MotionLimits, SimulatedBase
 from omnid.controller.controller import Controller
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.arming import AUTOMATIC, MANUAL, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import (
     Setpoint,

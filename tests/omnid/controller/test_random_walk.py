@@ -17,7 +17,7 @@ from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.controller import Controller
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL, NO_CONTACT, ArmRequest
+from omnid.core.control.arming import AUTOMATIC, MANUAL, NO_CONTACT, OPERATOR, ArmRequest, TimedSetpoint
 from omnid.core.control.collision_monitor import (
     BLOCKED,
     MOVING,
@@ -28,7 +28,6 @@ from omnid.core.control.collision_monitor import (
     ControllerScan,
     MovingPoint,
 )
-from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,

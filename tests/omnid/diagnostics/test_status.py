@@ -18,8 +18,7 @@ from drivers.motor import MotorStatus, VelocityCommand
 from omnid.config import PairConfig
 from omnid.controller.controller import Controller
 from omnid.controller.link import ControllerStatistics
-from omnid.core.control.arming import ArmRequest
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.arming import ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates

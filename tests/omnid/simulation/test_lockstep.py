@@ -29,8 +29,7 @@ from omnid.formats.tum import read_tum
 from omnid.simulation import lockstep
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.robot import make_robot
-from omnid.simulation.world import World
-from omnid.simulation.world_file import load_world
+from omnid.simulation.world import World, load_world
 from omnid.transport.session import BusConfig
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, WHEELS, Key
 from tests.bench.faults.images import Frozen, sector

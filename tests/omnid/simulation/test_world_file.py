@@ -12,8 +12,7 @@ import pytest
 from calib import se3
 from calib.rig import MountedCamera, Rig
 from omnid.errors import OmnidError
-from omnid.simulation.world import Walkers, clearance_m
-from omnid.simulation.world_file import load_world, shipped_worlds
+from omnid.simulation.world import Walkers, clearance_m, load_world, shipped_worlds
 from tests.simulation import Rectangle, Scene, make_rig, render
 
 HALL = """

@@ -19,7 +19,7 @@ from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.client import Robot
 from omnid.controller.link import ControllerStatistics
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.arming import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.voxel_map import MapPoints

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, transform
-from omnid.core.control.arming import MANUAL, ArmRequest
+from omnid.core.control.arming import MANUAL, OPERATOR, PLANNER, ArmRequest, TimedSetpoint
 from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
-from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.motion_monitor import MotionSettings

@@ -16,8 +16,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import BUMPER, CLIFF
 from omnid.core.navigation.requests import GoalRequest, NavigationCommand

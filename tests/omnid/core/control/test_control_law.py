@@ -10,9 +10,8 @@ from itertools import combinations
 import pytest
 
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC
-from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
-from omnid.core.control.command_sources import (
+from omnid.core.control.arming import (
+    AUTOMATIC,
     LOWER_PRIORITY,
     OPERATOR,
     OTHER_SENDER,
@@ -20,6 +19,7 @@ from omnid.core.control.command_sources import (
     CommandSelector,
     TimedSetpoint,
 )
+from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,

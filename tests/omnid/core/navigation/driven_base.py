@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative
-from omnid.core.control.arming import AUTOMATIC
-from omnid.core.control.command_sources import PLANNER, TimedSetpoint
+from omnid.core.control.arming import AUTOMATIC, PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.motion_monitor import MotionSettings
 from omnid.core.navigation.navigator import Navigation, Navigator

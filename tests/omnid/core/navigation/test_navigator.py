@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from omnid.core.control.arming import ArmRequest
-from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
+from omnid.core.control.arming import OPERATOR, ArmRequest, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.navigator import STOPS, WAITS, Navigation, Navigator
