@@ -9,10 +9,10 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from drivers.cameras.v4l2_controls import V4l2Settings
+from drivers.cameras.v4l2_device import V4l2Settings
 from drivers.errors import DriverError
-from drivers.logs.rotating_log import RotationSettings
-from drivers.logs.streams import TimeSource
+from drivers.logs.log_reader import TimeSource
+from drivers.logs.mcap_writer import RotationSettings
 from omnid.controller.motor import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.navigation.settings import NavigationSettings

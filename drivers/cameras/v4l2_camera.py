@@ -13,8 +13,14 @@ from typing import Final
 
 from drivers.backoff import Backoff
 from drivers.cameras.camera_state import CameraExposure, CameraState
-from drivers.cameras.v4l2_controls import V4l2Settings, exposure_in_force, exposure_ranges, follow_request
-from drivers.cameras.v4l2_device import V4l2Stream, device_error
+from drivers.cameras.v4l2_device import (
+    V4l2Settings,
+    V4l2Stream,
+    device_error,
+    exposure_in_force,
+    exposure_ranges,
+    follow_request,
+)
 from drivers.cameras.v4l2_ioctl import BufferFlag, Int32, V4l2Buffer
 from drivers.errors import DriverError, EventCallback, ignore_event
 from drivers.frame import Camera, Frame

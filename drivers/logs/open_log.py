@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import DriverError
+from drivers.logs.bags import Ros1Bag, SqliteBag
 from drivers.logs.image_folder import ImageFolder, image_folders
 from drivers.logs.log import Log, LogFile, listed
 from drivers.logs.mcap_file import McapFile
 from drivers.logs.mcap_writer import is_locked
-from drivers.logs.ros1_bag import Ros1Bag
-from drivers.logs.sqlite_bag import SqliteBag
 
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 # A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format.

@@ -15,8 +15,7 @@ from pathlib import Path
 from calib.atomic_file import write_file
 from calib.rig_file import png
 from drivers.cameras.v4l2_camera import V4l2Camera
-from drivers.cameras.v4l2_controls import V4l2Settings
-from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
+from drivers.cameras.v4l2_device import RULES_FILE, V4l2Settings, capture_devices, udev_rules
 from drivers.frame import CAMERAS as SIDES
 from drivers.frame import Camera, gray
 from drivers.motors.serial_motor import motor_protocol

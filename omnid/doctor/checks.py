@@ -17,8 +17,7 @@ from typing import Final, Literal, NamedTuple
 
 from calib.errors import CalibError
 from calib.rig_file import read_rig
-from drivers.cameras.v4l2_controls import V4l2Settings
-from drivers.cameras.v4l2_device import CaptureDevice
+from drivers.cameras.v4l2_device import CaptureDevice, V4l2Settings
 from drivers.errors import DriverError
 from drivers.motors.serial_motor import motor_protocol
 from omnid.config import RecordConfig

@@ -23,7 +23,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
-from drivers.logs.rotating_log import RotatingLog
+from drivers.logs.mcap_writer import RotatingLog
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.ipc import ARMED, ControllerState

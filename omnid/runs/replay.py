@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.frame import Frame
-from drivers.logs.log_reader import WHOLE, LogCameras, LogReader
-from drivers.logs.streams import MotionTopics
+from drivers.logs.log_reader import WHOLE, LogCameras, LogReader, MotionTopics
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from drivers.frame import Frame
-from drivers.logs.mcap_writer import LogWriter
-from drivers.logs.rotating_log import RotatingLog, RotatingLogState
+from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotatingLogState
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.errors import OmnidError

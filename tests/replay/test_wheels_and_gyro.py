@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.rig_file import read_rig
 from drivers.errors import DriverError
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import LogReader, MotionTopics
 from drivers.logs.ros_messages import IMU, ODOMETRY
-from drivers.logs.streams import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.config import load_config
 from omnid.formats.tum import read_tum

@@ -24,8 +24,15 @@ from drivers.cameras.camera_state import (
     ExposureSetting,
 )
 from drivers.cameras.v4l2_camera import BufferChecks, V4l2Camera
-from drivers.cameras.v4l2_controls import V4l2Settings, exposure_ranges, follow_request, set_controls
-from drivers.cameras.v4l2_device import V4l2Stream, capture_devices, udev_rules
+from drivers.cameras.v4l2_device import (
+    V4l2Settings,
+    V4l2Stream,
+    capture_devices,
+    exposure_ranges,
+    follow_request,
+    set_controls,
+    udev_rules,
+)
 from drivers.cameras.v4l2_ioctl import BufferFlag
 from drivers.errors import DriverError
 from drivers.frame import Frame

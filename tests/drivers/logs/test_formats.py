@@ -23,10 +23,9 @@ from mcap.writer import CompressionType
 from drivers.errors import DriverError, RecordError
 from drivers.frame import Frame
 from drivers.logs.log import unpack_message
-from drivers.logs.log_reader import LogCameras, LogReader
+from drivers.logs.log_reader import LogCameras, LogReader, MotionTopics
 from drivers.logs.mcap_file import MAGIC
 from drivers.logs.open_log import logs_in, open_log
-from drivers.logs.streams import MotionTopics
 from drivers.motion import GyroSample
 from tests.drivers.logs.mcap_logs import (
     BARE,

@@ -18,9 +18,8 @@ from rosbags.highlevel import AnyReader
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Camera, Frame, gray
-from drivers.logs.log_reader import WHOLE, LogCameras, LogReader
+from drivers.logs.log_reader import WHOLE, LogCameras, LogReader, TimeSource, choose_topics
 from drivers.logs.ros_messages import IMAGE_TYPES, IMU, ODOMETRY, parse_image, parse_motion
-from drivers.logs.streams import TimeSource, choose_topics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from tests.drivers.logs.mcap_logs import (
     COMPRESSED,

@@ -22,8 +22,7 @@ import pytest
 
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.v4l2_camera import V4l2Camera
-from drivers.cameras.v4l2_controls import V4l2Settings
-from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
+from drivers.cameras.v4l2_device import RULES_FILE, V4l2Settings, capture_devices, udev_rules
 from drivers.frame import Frame, gray
 from tests.hardware.guest.surroundings import DEVICES, Loopback, load_loopback
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from calib.rig_file import read_rig, write_rig
-from drivers.cameras.v4l2_controls import V4l2Settings
-from drivers.cameras.v4l2_device import CaptureDevice
+from drivers.cameras.v4l2_device import CaptureDevice, V4l2Settings
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from omnid.cli import main
 from omnid.config import RecordConfig

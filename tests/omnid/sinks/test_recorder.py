@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
-from drivers.logs.rotating_log import RotationSettings
+from drivers.logs.mcap_writer import RotationSettings
 from drivers.motor import VelocityCommand
 from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
