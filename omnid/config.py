@@ -18,7 +18,7 @@ from omnid.core.control.control_law import ControllerSettings
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.odometry.estimates import OdometryLimits
-from omnid.core.odometry.motion_settings import MotionSensorSettings
+from omnid.core.odometry.motion_sensors import MotionSensorSettings
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.place_map import PlaceLimits
 from omnid.core.stereo.matcher import MatchingSettings

@@ -96,7 +96,8 @@ class DenseDepths:
         # 2. Correct rows and disparities to the stamp of the pair.
         views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
         if exposure is not None:
-            views, noise = exposure.corrected(views[:, :2], views[:, 2])
+            views, of_motion = exposure.corrected(views[:, :2], views[:, 2])
+            noise = of_motion.noise(exposure.motion)
             by_motion = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = views[:, 2] - views[:, 1]

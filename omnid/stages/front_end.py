@@ -17,7 +17,6 @@ from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
-from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.rig_error import RigError
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -156,12 +155,11 @@ class FrontEnd:
             "refused_gyro": sensors.refused,
             "_warning": warning,
         }
-        wheels = {"wheel_scale": DISTANCE, "turn_scale": TURN, "wheel_offset_s": WHEEL_OFFSET}
-        gyro = {"gyro_offset_s": GYRO_OFFSET}
-        gyro |= {f"gyro_bias_{axis}_radps": BIAS.start + k for k, axis in enumerate("xyz")}
-        for states, count in ((wheels, inbox.wheels), (gyro, inbox.gyro)):
-            for name, state in states.items() if count and sensors.steps else ():
-                stats[name], stats[f"{name}_sigma"] = float(sensors.values[state]), float(sensors.sigmas[state])
+        distance, turn, *bias = sensors.values.tolist()
+        if inbox.wheels and sensors.steps:
+            stats |= {"wheel_scale": distance, "turn_scale": turn}
+        if inbox.gyro and sensors.steps:
+            stats |= {f"gyro_bias_{axis}_radps": value for axis, value in zip("xyz", bias, strict=True)}
         return stats
 
     def _update(self, pair: Panoramas, estimate: OdometryEstimate, state: TrackingState) -> OdometryUpdate:

@@ -62,11 +62,6 @@ class ViewShift:
         """Return the variances (N, 4) [px^2], as in by_motion, by the uncertainty of the velocity."""
         return np.asarray(np.einsum("nki,ij,nkj->nk", self.by_motion, motion.covariance, self.by_motion))
 
-    def column_sigma(self, motion: RigVelocity) -> Array:
-        """Return the standard deviation (N,) [px] of the upper column by the uncertainty of the velocity."""
-        J = self.by_motion[:, 3]
-        return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", J, motion.covariance, J)))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
@@ -103,34 +98,11 @@ class Exposure:
         rate, tau = self.motion.twist[:3] + np.cross(turn, points), times_s[:, None]
         return np.asarray(points - tau * rate + tau**2 / 2 * np.cross(turn, rate))
 
-    def derivatives(self, views: Array) -> Array:
-        """Return the derivatives (N, 3, K) of corrected views (N, 3) by the velocity; 0 where they have no point."""
-        points = triangulate(views, self.model.cylinder, self.model.baseline_m)
-        known = np.isfinite(points).all(axis=1)
-        found = np.zeros((len(views), 3, len(self.motion.twist)))
-        found[known] = self.shift(points[known]).by_motion[:, :3]
-        return found
-
-    def upper_columns(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
-        """Return the columns (N,) in the upper panorama of pixels (N, 2) at about upper rows (N,), and their spread.
-
-        The spread (N,) [px] is twice the standard deviation by the uncertainty of the velocity. NaN where the views
-        cannot be triangulated.
-        """
-        if self.times.is_at_once:
-            return pixels[:, 0].copy(), np.zeros(len(pixels))
-        views, _ = self.corrected(pixels, rows)
-        points = triangulate(views, self.model.cylinder, self.model.baseline_m)
-        known = np.isfinite(points).all(axis=1)
-        columns, spread_px = np.full((2, len(pixels)), np.nan)
-        shift = self.shift(points[known])
-        columns[known], spread_px[known] = views[known, 0] - shift.upper[:, 0], 2 * shift.column_sigma(self.motion)
-        return columns, spread_px
-
     def upper_pixels(self, pixels: Array, disparity: Array) -> tuple[Array, Array]:
         """Return where the upper panorama shows pixels (N, 2) whose disparities (N,) at the stamp are known: (N, 2).
 
-        Also the spread (N,) of the columns, as `upper_columns`. NaN where the disparity is unknown.
+        Also the spread (N,) [px] of the columns, twice the standard deviation by the uncertainty of the velocity. NaN
+        where the disparity is unknown.
         """
         if self.times.is_at_once:
             return np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]), np.zeros(len(pixels))
@@ -140,24 +112,24 @@ class Exposure:
         # The lower pixel is known as seen: its view at the stamp differs by shift.lower.
         upper, spread_px = np.full((len(pixels), 2), np.nan), np.full(len(pixels), np.nan)
         upper[known] = views[:, [0, 2]] + shift.lower - shift.upper
-        spread_px[known] = 2 * shift.column_sigma(self.motion)
+        spread_px[known] = 2 * np.sqrt(shift.variance(self.motion)[:, 3])
         return upper, spread_px
 
-    def corrected(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
-        """Return views (N, 3) at the stamp of pixels (N, 2) and upper rows (N,) as seen, and their noise (N, 3, 3).
+    def corrected(self, pixels: Array, rows: Array) -> tuple[Array, ViewShift]:
+        """Return views (N, 3) at the stamp of pixels (N, 2) and upper rows (N,) as seen, NaN: without a point.
 
-        The shift depends on the depth, and the depth on the corrected view: so both are computed in turn.
+        Also their shifts. The shift depends on the depth, and the depth on the corrected view: so both are computed in
+        turn.
         """
-        views = np.column_stack([pixels, rows])
-        noise = np.zeros((len(views), 3, 3))
-        for _ in range(0 if self.times.is_at_once else ROUNDS):
+        views = seen = np.column_stack([pixels, rows])
+        if self.times.is_at_once:
+            return views, self.shift(views)
+        for _ in range(ROUNDS):
             points = triangulate(views, self.model.cylinder, self.model.baseline_m)
-            known = np.isfinite(points).all(axis=1)
-            shift = self.shift(points[known])
-            views = np.column_stack([pixels, rows])
-            views[known] += np.column_stack([shift.lower, shift.upper[:, 1]])
-            noise[known] = shift.noise(self.motion)
-        return views, noise
+            known = np.isfinite(points).all(axis=1, keepdims=True)
+            shift = self.shift(np.where(known, points, 1.0))
+            views = np.where(known, seen + np.column_stack([shift.lower, shift.upper[:, 1]]), np.nan)
+        return views, shift
 
     def column_shift(self, shape: tuple[int, int], pad_px: int) -> ColumnShift:
         """Return the shift of the upper columns of panoramas (H, W), which are padded by pad_px columns."""
@@ -165,7 +137,8 @@ class Exposure:
         grid_px, near = at_scale(GRID_PX, cylinder.scale), cylinder.scale * np.array(DISPARITIES_PX)
         rows, columns = (grid_px * (np.arange(-(-size // grid_px)) + 0.5) - 0.5 for size in shape)
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        shifts = [cylinder.wrap(self.upper_columns(grid, grid[:, 1] + d)[0] - grid[:, 0]) for d in near]
+        corrected = [self.corrected(grid, grid[:, 1] + d) for d in near]
+        shifts = [cylinder.wrap(views[:, 0] - shift.upper[:, 0] - grid[:, 0]) for views, shift in corrected]
         slope = (shifts[1] - shifts[0]) / (near[1] - near[0])
         whole = len(columns) * grid_px, len(rows) * grid_px
         mode: Literal["wrap", "edge"] = "wrap" if cylinder.width == cylinder.turn_px else "edge"

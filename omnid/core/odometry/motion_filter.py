@@ -2,8 +2,8 @@
 
     x = [v, a, s, e],    v <- v + dt a,    T <- T exp(v dt),    e <- Ad(exp(-v dt)) e + dt v_error
 
-v and a (6 each) are those of Dang et al. 2012, eq. (10) and (11), of the rectified frame in its own axes; s (7) scales,
-offsets and bias of wheels and gyro (motion_sensors.py); e (6) is the error of the pose [t; r], which is zero itself:
+v and a (6 each) are those of Dang et al. 2012, eq. (10) and (11), of the rectified frame in its own axes; s (5) scales
+and bias of wheels and gyro (motion_sensors.py); e (6) is the error of the pose [t; r], which is zero itself:
 only its covariance is followed. Measurements are applied in the order of trust, each with a gate by its Mahalanobis
 distance: the step of the cameras, which also sets the pose's covariance, then what wheels and gyro measured in it. One
 that is refused is none. A frame in which the cameras find nothing is prediction, and the errors of scales and bias add
@@ -24,19 +24,19 @@ from omnid.core.odometry.exposure_times import RigVelocity
 from omnid.core.odometry.motion_sensors import (
     ACCELERATION_SIGMAS,
     AHEAD,
+    BIAS,
     DISTANCE,
     TURN,
     YAW,
     MotionSensors,
     Twist,
-    at_rest,
     on_a_plane,
 )
 from omnid.core.odometry.pose_estimation import OUTLIER_SQUARED
 
 Array = NDArray[np.float64]
 
-VELOCITY, ACCELERATION, SENSORS, POSE, SIZE = slice(0, 6), slice(6, 12), slice(12, 19), slice(19, 25), 25
+VELOCITY, ACCELERATION, SENSORS, POSE, SIZE = slice(0, 6), slice(6, 12), slice(12, 17), slice(17, 23), 23
 # Spectral density of the jerk for translation and rotation, (m/s^3)^2/Hz and (rad/s^3)^2/Hz, of a wheeled robot.
 # Measured: with 0.67 and 1.5 times as much the odometry errs 0.98 to 1.01 times as much, but for one log at 1152 px
 JERK_PSD = (10.0, 40.0)
@@ -47,18 +47,15 @@ SLOWING_S = 0.3  # time constant of the predicted velocity's decay meanwhile
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # of a pose, m and rad: larger ones would leave no digits to differences
 # Errors of wheels and gyro at the start, their standard deviations, and those of their random walks over one second.
 # After many steps that do not agree the deviations are ten times as large, so that all is learned again.
-START = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-START_SIGMA = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
-WALK_SIGMA = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
-STATES_OF = {WheelSample: slice(0, 3), GyroSample: slice(3, 7)}
+START = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
+START_SIGMA = np.array([0.05, 0.1, 0.02, 0.02, 0.02])
+WALK_SIGMA = np.array([2e-4, 5e-4, 5e-5, 5e-5, 5e-5])
+STATES_OF: dict[type[MotionSample], slice] = {WheelSample: slice(0, 2), GyroSample: BIAS}
 SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales: beyond them their settings are wrong.
 CAMERA_SIGMA = np.repeat([3e-4, 1e-4], 3)  # of the cameras' step, m and rad, in addition to its covariance
 # Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,
 # because each step is another measurement. After the larger number the sensor counts as not calibrated.
 SLIPPING, MOST_OUTLIERS = 2, 40
-# The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
-# mean of the squared innovations by their expected values, over 50 steps because a floor is the same for some seconds.
-NOISE_GAIN = 0.02
 
 
 class MotionFilter:
@@ -81,7 +78,6 @@ class MotionFilter:
         self.slips = self.refused = self.steps = 0
         self._outliers: dict[type[MotionSample], int] = {WheelSample: 0, GyroSample: 0}
         self._disagreements = 0  # consecutive steps in which the turns of wheels and gyro differ
-        self._noise_factors = np.ones(2)  # of the wheels' distance and turn
         self._before_sensing = self._filter.x, self._filter.P
         self._bridged_s = self._bridged_m2 = 0.0  # time and variance of the position since the cameras found it
         self._is_over = False  # they are beyond the limits: wheels and gyro are left out until then
@@ -111,13 +107,8 @@ class MotionFilter:
 
     @property
     def values(self) -> Array:
-        """Scales of distance and turn, offsets of wheels and gyro [s], bias of the gyro [rad/s]: (7,)."""
+        """Scales of the wheels' distance and turn, and bias of the gyro [rad/s]: (5,)."""
         return np.array(self._filter.x[SENSORS, 0])
-
-    @property
-    def sigmas(self) -> Array:
-        """Standard deviations (7,) of the values."""
-        return np.asarray(np.sqrt(np.diag(self._filter.P)[SENSORS]))
 
     @property
     def wheels_are_sane(self) -> bool:
@@ -174,18 +165,15 @@ class MotionFilter:
         #    twice in a row slip, as those that the cameras contradict, and are left out.
         values, wheels, gyro = self.values, Twist(), Twist()
         if interval_s is not None and dt_s > 0 and not self._is_over:
-            gyro = self.sensors.by_gyro(interval_s, values)
+            gyro = self.sensors.measured(GyroSample, interval_s, values)
             if self.wheels_are_sane and not self.is_slipping:
-                wheels = self.sensors.by_wheels(interval_s, values, self._noise_factors)
-        if interval_s is not None and wheels and self.sensors.are_at_rest(interval_s, values):
-            twist = at_rest(values)
-        else:
-            differ = YAW in wheels and YAW in gyro and self._differ(wheels, gyro)
-            self._disagreements = self._disagreements + 1 if differ else 0
-            if self._disagreements >= SLIPPING:
-                wheels = Twist()
-                self.slips += 1
-            twist = (on_a_plane(wheels, values) if wheels else wheels) | gyro
+                wheels = self.sensors.measured(WheelSample, interval_s, values)
+        differ = YAW in wheels and YAW in gyro and self._differ(wheels, gyro)
+        self._disagreements = self._disagreements + 1 if differ else 0
+        if self._disagreements >= SLIPPING:
+            wheels = Twist()
+            self.slips += 1
+        twist = (on_a_plane(wheels, values) if wheels else wheels) | gyro
         is_complete = AHEAD in twist and YAW in twist
         # 2. The prediction; a velocity that was not known is learned from its start.
         if self._is_unknown and is_complete:
@@ -270,22 +258,14 @@ class MotionFilter:
         """Update with what the sensors measured in a step of the cameras, and count where they disagree with it."""
         self.steps += 1
         values = self.values
-        for sensor, twist in (
-            (WheelSample, self.sensors.by_wheels(interval_s, values, self._noise_factors)),
-            (GyroSample, self.sensors.by_gyro(interval_s, values)),
-        ):
+        for sensor in STATES_OF:
+            twist = self.sensors.measured(sensor, interval_s, values)
             if not twist:
                 continue
-            ratios = {axis: self._measure(twist, axis, values, dt_s, is_gated=True) for axis in twist}
-            agrees = all(ratio <= OUTLIER_SQUARED for ratio in ratios.values())
-            if sensor is WheelSample:
-                self.slips += not agrees
-                for number, axis in enumerate((AHEAD, YAW)):
-                    if ratios.get(axis, math.inf) < OUTLIER_SQUARED:
-                        factor = self._noise_factors[number] * (1.0 + NOISE_GAIN * (ratios[axis] - 1.0))
-                        self._noise_factors[number] = max(1.0, factor)
-            else:
-                self.refused += not agrees
+            ratios = [self._measure(twist, axis, values, dt_s, is_gated=True) for axis in twist]
+            agrees = max(ratios) <= OUTLIER_SQUARED
+            self.slips += sensor is WheelSample and not agrees
+            self.refused += sensor is GyroSample and not agrees
             self._outliers[sensor] = 0 if agrees else self._outliers[sensor] + 1
             if self._outliers[sensor] > MOST_OUTLIERS:
                 # Its settings may be wrong: they are learned again.

@@ -1,41 +1,68 @@
 """Samples of wheels and gyro, and what they say about the motion of the base in a step.
 
 The base moves along arcs on a plane. A sensor has errors that are the same in all steps: scales of the wheels' distance
-and turn, offsets of the clocks, bias of the gyro. The motion filter estimates them as states (motion_filter.py).
+and turn, bias of the gyro. The motion filter estimates them as states (motion_filter.py). An offset of its clock moves
+the ends of a step: what the rate changes by in between is noise, and does not add up from step to step.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.nanoseconds import SecondsSinceFirst
 
 Array = NDArray[np.float64]
 
-# States: scales of the wheels' distance and turn, offsets [s] that are added to the stamps of wheels and gyro, and bias
-# (3,) [rad/s] of the gyro.
-DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
-AHEAD, YAW = 0, 5  # components of the twist of the base that wheels measure
+# States: scales of the wheels' distance and turn, and bias (3,) [rad/s] of the gyro.
+DISTANCE, TURN, BIAS = 0, 1, slice(2, 5)
+AHEAD, ROLL, YAW = 0, 3, 5  # components of the twist of the base: wheels measure two, a gyro the last three
 # Errors of a step that are independent of those of other steps, by sigma: shares of the wheels' distance and turn for
 # roughness and slack, least errors for the steps of encoders, noise of the gyro over one second.
-WHEEL_SHARES, WHEEL_LEAST, GYRO_RADPS_SQRT_S = (0.01, 0.02), (3e-4, 5e-4), 1e-3
+WHEEL_SHARES, WHEEL_LEAST, GYRO_RADPS_SQRT_S = (0.02, 0.04), (6e-4, 1e-3), 1e-3
 # Wheels roll forwards on a plane: lateral error as a share of the way and at least, vertical error, roll and pitch.
 SIDE_SHARE, SIDE_M, HEIGHT_M, TILT_RAD = 0.01, 3e-4, 5e-4, 1e-3
 # Sigmas of an acceleration that is not known, m/s^2 and rad/s^2: about half of the most that controller.limits allows
 # by default, 1.5 m/s^2 and 3 rad/s^2.
 ACCELERATION_SIGMAS: Final = (1.0, 2.0)
-# At rest: rates of wheels [m/s, rad/s] and of the gyro without its bias, also for this time before the step, so that
-# nothing swings on; and the motion that is left, m and rad.
-STILL_WHEELS, STILL_GYRO, STILL_BEFORE_S = np.array([0.003, 0.01]), 0.03, 0.2
-STILL_M, STILL_RAD = 1e-4, 5e-5
+OFFSET_S = 0.02  # standard deviation of the clocks of wheels and gyro against that of the images
 LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval.
 MOST_SAMPLES = 4096  # Samples that are kept, so that memory is bounded: 16 seconds of a sensor of 250 Hz.
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSensorSettings:
+    """Wheels and gyro in addition to the cameras. Scales and bias are estimated on the way."""
+
+    wheels: Annotated[
+        str,
+        "speeds of the wheels; auto: those that the motor controller reports, of the bus (cmd/wheel_odom), or of the "
+        "only topic of a log with nav_msgs/msg/Odometry whose name contains 'wheel'; off; or that topic of the log",
+    ] = "auto"
+    imu: Annotated[
+        str,
+        "gyro; auto: that of the bus (cmd/imu), or of the only topic of a log with sensor_msgs/msg/Imu; off; or that "
+        "topic of the log",
+    ] = "auto"
+    imu_rpy_deg: Annotated[
+        tuple[float, float, float],
+        "orientation of the IMU on the base: roll about x, then pitch about y, then yaw about z, deg; not applied to "
+        "messages in the frame base_link",
+    ] = (0.0, 0.0, 0.0)
+
+    @property
+    def R_base_imu(self) -> Array:
+        """Rotation (3, 3) from the axes of the IMU to those of the base."""
+        roll, pitch, yaw = np.radians(self.imu_rpy_deg)
+        turns = ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])
+        return np.asarray(np.linalg.multi_dot([se3.rotation_exp(turn) for turn in turns]))
 
 
 class RateHistory:
@@ -78,21 +105,21 @@ class RateHistory:
         )
         return np.where(is_known[..., None], whole, np.nan)
 
-    def missing_s(self, end_s: float) -> float:
-        """Return the time before the end of an interval over which `integrals` holds the rates of the last sample."""
-        return max(0.0, end_s - float(self._times[-1]))
+    def variance_of_ends(self, start_s: Array, end_s: Array, acceleration: Array) -> Array:
+        """Return the variances (size,) of an integral by the offset of the clock, and by what is missing at its end.
 
-    def is_below(self, start_s: float, end_s: float, zero: Array, limits: Array | float) -> bool | None:
-        """Return whether the rates in an interval differ from zero (size,) by less than limits; None: no samples."""
-        inner = self._rates[(self._times >= start_s) & (self._times <= end_s)] - zero
-        return bool((np.abs(inner) < limits).all()) if len(inner) else None
+        acceleration (size,): standard deviation of the change of the rates after the last sample.
+        """
+        moved = OFFSET_S * (self.at(end_s) - self.at(start_s))
+        missing = acceleration * max(0.0, float(end_s - self._times[-1])) ** 2 / 2
+        return np.asarray(moved**2 + missing**2)
 
 
 class Measured(NamedTuple):
     """One component of the twist of the base in a step, by a sensor."""
 
     value: float  # m, rad
-    slopes: Array  # (7,) by the states
+    slopes: Array  # (5,) by the states
     variance: float  # by errors that are independent from step to step
 
 
@@ -103,72 +130,51 @@ class MotionSensors:
     """The samples of wheels and gyro."""
 
     def __init__(self) -> None:
-        self._wheels, self._gyro = RateHistory(2), RateHistory(3)
+        self._histories: dict[type[MotionSample], RateHistory] = {
+            WheelSample: RateHistory(2),
+            GyroSample: RateHistory(3),
+        }
         self.seconds = SecondsSinceFirst().seconds
 
     def add(self, samples: Iterable[MotionSample]) -> None:
         """Add samples; they may come late, and in any order."""
-        wheels: list[tuple[float, ...]] = []
-        gyro: list[tuple[float, ...]] = []
+        new: dict[type[MotionSample], list[tuple[float, ...]]] = {WheelSample: [], GyroSample: []}
         for sample in samples:
             if isinstance(sample, WheelSample):
-                wheels.append((self.seconds(sample.stamp_ns), sample.velocity_mps, sample.yaw_rate_radps))
+                rates: tuple[float, ...] = sample.velocity_mps, sample.yaw_rate_radps
             else:
-                gyro.append((self.seconds(sample.stamp_ns), sample.x_radps, sample.y_radps, sample.z_radps))
-        self._wheels.add(wheels)
-        self._gyro.add(gyro)
+                rates = sample.x_radps, sample.y_radps, sample.z_radps
+            new[type(sample)].append((self.seconds(sample.stamp_ns), *rates))
+        for sensor, history in self._histories.items():
+            history.add(new[sensor])
 
     def motion(self, sensor: type[MotionSample], starts_s: Array, ends_s: Array, states: Array) -> Array:
         """Return distance and turn (..., 2) by wheels, or the turns (..., 3) by a gyro without its bias, as reported.
 
         The times [s] are those of `seconds`; NaN where no samples cover an interval.
         """
-        if sensor is WheelSample:
-            return self._wheels.integrals(starts_s, ends_s)
-        return np.asarray(self._gyro.integrals(starts_s, ends_s) - states[BIAS] * (ends_s - starts_s)[..., None])
+        moved = self._histories[sensor].integrals(starts_s, ends_s)
+        return moved if sensor is WheelSample else moved - states[BIAS] * (ends_s - starts_s)[..., None]
 
-    def by_wheels(self, interval_s: tuple[float, float], states: Array, noise_factors: Array) -> Twist:
-        """Return what the wheels measure in a step: distance and turn, each if it is known."""
-        start_s, end_s = np.array(interval_s) - states[WHEEL_OFFSET]
-        amounts, found = self.motion(WheelSample, start_s, end_s, states), Twist()
+    def measured(self, sensor: type[MotionSample], interval_s: tuple[float, float], states: Array) -> Twist:
+        """Return what a sensor measures in a step: wheels distance and turn, each if it is known, a gyro all turns."""
+        start_s, end_s = (np.array(time_s) for time_s in interval_s)
+        amounts, dt_s, found = self.motion(sensor, start_s, end_s, states), interval_s[1] - interval_s[0], Twist()
         if not np.isfinite(amounts).any():
             return found
-        changes = np.diff(self._wheels.at(np.array([start_s, end_s])), axis=0)[0]
-        missing_s = self._wheels.missing_s(end_s)
-        for number, (axis, state) in enumerate(((AHEAD, DISTANCE), (YAW, TURN))):
-            amount, slopes = float(amounts[number]), np.zeros(len(states))
-            if math.isfinite(amount):
-                slopes[state], slopes[WHEEL_OFFSET] = amount, -states[state] * changes[number]
-                noise = noise_factors[number] * ((WHEEL_SHARES[number] * amount) ** 2 + WHEEL_LEAST[number] ** 2)
-                late = ACCELERATION_SIGMAS[number] * missing_s**2 / 2
-                found[axis] = Measured(float(states[state] * amount), slopes, noise + late**2)
-        return found
-
-    def by_gyro(self, interval_s: tuple[float, float], states: Array) -> Twist:
-        """Return what the gyro measures in a step: the turns about all axes."""
-        start_s, end_s = np.array(interval_s) - states[GYRO_OFFSET]
-        amounts, found, dt_s = self.motion(GyroSample, start_s, end_s, states), Twist(), end_s - start_s
-        if not np.isfinite(amounts).all():
-            return found
-        changes = np.diff(self._gyro.at(np.array([start_s, end_s])), axis=0)[0]
-        late = ACCELERATION_SIGMAS[1] * self._gyro.missing_s(end_s) ** 2 / 2
-        for axis in range(3):
+        is_wheels = sensor is WheelSample
+        acceleration = np.array(ACCELERATION_SIGMAS if is_wheels else ACCELERATION_SIGMAS[1:])
+        of_ends = self._histories[sensor].variance_of_ends(start_s, end_s, acceleration)
+        for number, amount in enumerate(amounts.tolist()):
             slopes = np.zeros(len(states))
-            slopes[BIAS.start + axis], slopes[GYRO_OFFSET] = -dt_s, -changes[axis]
-            found[3 + axis] = Measured(float(amounts[axis]), slopes, GYRO_RADPS_SQRT_S**2 * dt_s + late**2)
+            if is_wheels and math.isfinite(amount):
+                slopes[number] = amount
+                noise = (WHEEL_SHARES[number] * amount) ** 2 + WHEEL_LEAST[number] ** 2
+                found[(AHEAD, YAW)[number]] = Measured(states[number] * amount, slopes, noise + of_ends[number])
+            elif not is_wheels:
+                slopes[BIAS.start + number] = -dt_s
+                found[ROLL + number] = Measured(amount, slopes, GYRO_RADPS_SQRT_S**2 * dt_s + of_ends[number])
         return found
-
-    def are_at_rest(self, interval_s: tuple[float, float], states: Array) -> bool:
-        """True if wheels, and the gyro if there is one, are at rest in a step and STILL_BEFORE_S before it."""
-        start_s, end_s = interval_s[0] - STILL_BEFORE_S, interval_s[1]
-        gyro_rests = self._gyro.is_below(start_s, end_s, states[BIAS], STILL_GYRO)
-        return bool(self._wheels.is_below(start_s, end_s, np.zeros(2), STILL_WHEELS)) and gyro_rests is not False
-
-
-def at_rest(states: Array) -> Twist:
-    """Return the twist of a base that does not move."""
-    none = np.zeros(len(states))
-    return {axis: Measured(0.0, none, (STILL_M if axis < 3 else STILL_RAD) ** 2) for axis in range(6)}
 
 
 def on_a_plane(wheels: Twist, states: Array) -> Twist:

@@ -132,7 +132,7 @@ class PoseSearch:
         #    wrong one is an outlier of the pose.
         guess = tracks.pixels + shift.lower - shift.upper
         guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
-        spread_px = 2 * shift.column_sigma(exposure.motion)
+        spread_px = 2 * np.sqrt(shift.variance(exposure.motion)[:, 3])
         pair = frame.lower, frame.upper
         rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, REACH_PX, spread_px)
         disparity = rows - tracks.pixels[:, 1]

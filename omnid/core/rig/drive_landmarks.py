@@ -19,7 +19,7 @@ from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
 from omnid.core.odometry.exposure_times import NO_VELOCITY
 from omnid.core.odometry.local_map import Keyframe, LocalMap, NewLandmarks
-from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
+from omnid.core.odometry.plane_patches import REACH_PX, disparity_slopes, fitted_slopes
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.types.panorama import Panoramas
 from omnid.core.types.stereo_model import StereoModel
@@ -37,8 +37,6 @@ MAX_KEYFRAMES: Final = 25
 # Two keyframes and the landmark's own three coordinates leave almost nothing that the rig could contradict, so that
 # there must be a third.
 MIN_KEYFRAMES: Final = 3
-# Largest step of a patch: twice that of patches whose depth is known well, since the rig is not yet.
-REACH_PX: Final = 2
 # In the upper panorama the disparity predicts the place, so that one level is enough.
 TRACK_UPPER: Final = KltSettings(levels=1)
 
@@ -130,7 +128,8 @@ class DriveLandmarks:
     ) -> tuple[Array, Flags]:
         """Return pixels (M, 2) of landmarks near those given, by their first keyframes' patches, and which fit."""
         image = current.upper if upper else current.lower
-        aligned = self._map.align(image, T_odom_rect, rows, near, REACH_PX, upper=upper)
+        # A patch may move twice as far as one whose depth is known well, since the rig is not yet.
+        aligned = self._map.align(image, T_odom_rect, rows, near, 2 * REACH_PX, upper=upper)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
         return np.column_stack([current.lower.own(pixels[:, 0]), pixels[:, 1]]), aligned.found
 

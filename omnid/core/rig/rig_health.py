@@ -27,6 +27,7 @@ from calib.fit.rig_drift import RigDrift, estimate_rig_drift
 from calib.panorama import Cylinder, at_scale
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.pose_estimation import OUTLIER_SQUARED
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.semiglobal import MIN_DISPARITY_PX
 from omnid.core.stereo.tiles import TEXTURE_GREY
@@ -44,7 +45,7 @@ POINTS: Final = 160
 COARSE: Final = 4
 # Half the side of a patch, in the reduced image: 36 px of the panorama, some ten degrees at 1300 columns. At all
 # scales, because fewer pixels match by chance.
-PATCH_PX: Final = 4
+PATCH_PX: Final = COARSE
 # Search range to either side and downwards, in the reduced image at scale 1: five degrees of 1300 columns, because a
 # rig that is wrong by more finds chance matches only; and a point at one and a half baselines.
 ASIDE_PX, DOWN_PX = 5, 30
@@ -62,7 +63,7 @@ DRIFTED_DEG, BROKEN_DEG = 0.2, 2.0
 # Weight of the shift's angle against the rotation's, because a shifted viewpoint affects near points only.
 SHIFT_WEIGHT: Final = 0.2
 # Standard deviations subtracted from rotation and shift: an uncertain finding accuses no rig.
-SIGMAS: Final = 4.0
+SIGMAS: Final = math.sqrt(OUTLIER_SQUARED)
 # Least part of the points with contrast that match: with a rig that is wrong by many degrees they match by chance only.
 # Corners without contrast are noise, which matches with no rig.
 MIN_MATCHED_PART: Final = 0.08
@@ -167,11 +168,10 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
     below, above = points[good], there[good]
     if exposure is not None:
         # 4. Views at the stamp of the pair, where its images were exposed at several times.
-        views, _ = exposure.corrected(below, above[:, 1])
-        columns, _ = exposure.upper_columns(below, above[:, 1])
-        known = np.isfinite(columns)
-        shift_px = exposure.model.cylinder.wrap(views[known, 0] - columns[known])
-        below, above = views[known, :2], np.column_stack([above[known, 0] + shift_px, views[known, 2]])
+        views, of_motion = exposure.corrected(below, above[:, 1])
+        known = np.isfinite(views).all(axis=1)
+        columns = above[:, 0] + of_motion.upper[:, 0]
+        below, above = views[known, :2], np.column_stack([columns, views[:, 2]])[known]
     return Matches(below, above, len(points), clear)
 
 

@@ -138,9 +138,9 @@ def test_views_are_corrected_to_the_instant_of_the_stamp(times: PixelTimes) -> N
         assert np.abs(error).max() < 0.05  # the time is that of the nearest pixel
     assert np.abs(np.r_[shift.lower, shift.upper]).max() > 1.0, "the motion matters"
     # Without the points: from the pixels and rows that are measured.
-    views, _ = exposure.corrected(lower, upper[:, 1])
+    views, found = exposure.corrected(lower, upper[:, 1])
     error = views - truth
     error[:, 0] = LARGE.cylinder.wrap(error[:, 0])
     assert np.abs(error).max() < 0.05
-    columns, spread_px = exposure.upper_columns(lower, upper[:, 1])
-    assert np.abs(LARGE.cylinder.wrap(columns - upper[:, 0])).max() < 0.05 and (spread_px > 0).all()
+    off_px = LARGE.cylinder.wrap(views[:, 0] - found.upper[:, 0] - upper[:, 0])
+    assert np.abs(off_px).max() < 0.05 and (found.variance(exposure.motion)[:, 3] > 0).all()
