@@ -21,7 +21,7 @@ from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.commands import options
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
-from omnid.diagnostics.run_summary import Progress, run_summary, summary_entries
+from omnid.diagnostics.run_summary import Progress, summary_entries, timing_table
 from omnid.engine.graph import nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
@@ -188,14 +188,15 @@ def replay_and_print(log: Path, config: Config, asked: ReplayOptions, args: argp
         options.warn(warning)
     if getattr(args, "json", False):
         found = {name: getattr(result, name) for name in ("counters", "warnings", "signal", "elapsed_s")}
-        options.print_json(found | {"timings": {stage: row._asdict() for stage, row in result.timings.items()}})
+        options.print_json(found | {"timings": result.timings})
     else:
         entries = summary_entries(result.counters, verbose=args.verbose)
         pairs_hz = result.counters.pairs / max(1e-3, result.elapsed_s)
         entries["speed"] = f"{pairs_hz:.1f} pairs/s, in {result.elapsed_s:.1f} s"
         if files := [path for _, path in asked.files] + ([result.map_file] if result.map_file else []):
             entries["written"] = ", ".join(map(str, files))
-        print(run_summary(entries, result.timings.values() if args.verbose else ()))
+        lines = [f"{name:<9} {text}" for name, text in entries.items()]
+        print(*(timing_table(result.timings) if args.verbose else ()), *lines, sep="\n")
     return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from drivers.frame import CAMERAS
 from omnid.config import Config
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import SIDES, Side
 from omnid.engine.logging_setup import HANDLER
-from omnid.engine.telemetry import SummaryRow
+from omnid.engine.robot_clock import RobotClock
+from omnid.engine.telemetry import Histogram
 from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
 from omnid.tracking_state import TrackingState
@@ -26,7 +28,9 @@ from omnid.transport.status_names import NOTABLE_SHARE
 class RunStatistics:
     """A sink that counts poses; other threads may read its attributes meanwhile."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: RobotClock | None = None) -> None:
+        """clock: of the stamps of a live run, which measures how long its poses take; None: the run is over a log."""
+        self.to_pose, self._clock = Histogram(), clock  # from the stamp of a pair to its pose [s]
         self.poses = 0
         self.length_m = 0.0
         self.states: Counter[str] = Counter()
@@ -38,6 +42,8 @@ class RunStatistics:
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Count a pose."""
+        if self._clock is not None:
+            self.to_pose.add((self._clock.monotonic_ns() - odometry.stamp_ns) * S_PER_NS)
         # 1. The way.
         position = odometry.T_odom_rig[:3, 3]
         if self._position is not None:
@@ -109,16 +115,13 @@ def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str
     return {name: text for name, text in found.items() if text or name == "states"}
 
 
-def run_summary(entries: Mapping[str, str], timings: Iterable[SummaryRow] = ()) -> str:
-    """Return texts by name, one a line, after a row for each stage of the timings that processed messages."""
-    lines = [f"{name:<9} {text}" for name, text in entries.items()]
-    rows = [
-        f"{r.stage:<17}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in timings if r.n
-    ]
-    if not rows:
-        return "\n".join(lines)
-    head = f"{'stage':<17}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"
-    return "\n".join([head, *rows, "", *lines])
+def timing_table(timings: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    """Yield a line for each stage that has processed messages, below their titles."""
+    yield f"{'stage':<17}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"
+    for stage, row in timings.items():
+        if row["n"]:
+            yield f"{stage:<17}{{n:>8}}{{drops:>7}}{{p50_ms:>9.2f}}{{p99_ms:>9.2f}}{{max_ms:>9.2f}}".format(**row)
+    yield ""
 
 
 class Progress:

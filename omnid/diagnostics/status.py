@@ -16,10 +16,10 @@ from omnid.core.control.arming import STARTED
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.core.rig.rig_health import VIEWS, RigHealth, RigState
+from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.telemetry import Histogram, StageStats, Telemetry
+from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
@@ -38,16 +38,12 @@ class StatusCollector:
         cameras: Mapping[Camera, CameraState],
         pair: Synchronise,
         statistics: RunStatistics,
-        to_pose: Histogram,
         parts: Mapping[str, Callable[[], Stats]],
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """to_pose: from the capture of images to their pose [s]. parts: numbers of the other parts, by their names.
-
-        clock_ns: the clock of the stamps of images and poses.
-        """
+        """parts: numbers of the other parts, by their names. clock_ns: the clock of the stamps of images and poses."""
         self._telemetry, self._cameras, self._pair, self._statistics = telemetry, cameras, pair, statistics
-        self._to_pose, self._parts, self._clock_ns = to_pose, parts, clock_ns
+        self._parts, self._clock_ns = parts, clock_ns
         self._before: dict[str, int] = {}  # counts of the last report
         self._before_s, self._span_s = time.monotonic(), math.nan
 
@@ -78,8 +74,8 @@ class StatusCollector:
         state, fault = newest.state, newest.image_fault
         if newest.light.is_too_dark and state != TrackingState.LOST:
             fault = "it is too dark"
-        severity = {TrackingState.LOST: "_error", TrackingState.DEGRADED: "_warning"}.get(state, "_words")
-        severity = "_warning" if fault and severity == "_words" else severity
+        of_tracking = "_warning" if fault else "_words"
+        severity = {TrackingState.LOST: "_error", TrackingState.TRACKING: of_tracking}.get(state, "_warning")
         age_s = self._age_s(newest.stamp_ns)
         return {
             Key.RATE_HZ: self._rate_hz("poses", self._statistics.poses),
@@ -91,7 +87,7 @@ class StatusCollector:
             "length_m": self._statistics.length_m,
             "level_grey": newest.light.level_grey,
             "contrast_to_noise": newest.light.contrast_to_noise,
-            **times(status_names.CAPTURE_TO_POSE, self._to_pose),
+            **times(status_names.CAPTURE_TO_POSE, self._statistics.to_pose),
             **({"_stale": "no new pose"} if age_s > TIMEOUT_S else {severity: f"{state}: {fault}" if fault else state}),
         }
 
@@ -113,10 +109,7 @@ class StatusCollector:
             ),
             "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them": pairs_hz == 0,
         }
-        warning = next((words for words, is_so in warnings.items() if is_so), "")
-        is_corrected = bool(stats["exposure_skew_ms"])
-        words = "not synchronised: the motion between the exposures is corrected" if is_corrected else "synchronised"
-        return stats | {"_warning": warning, "_words": words}
+        return stats | {"_warning": next((words for words, is_so in warnings.items() if is_so), "")}
 
     def _camera(self, name: Camera) -> Stats:
         state, age_s = self._cameras[name], self._age_s(self._pair.newest_ns[name])
@@ -172,19 +165,14 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
 def stage_stats(stage: StageStats, rate_hz: float = math.nan) -> Stats:
     """Return the numbers of a stage: work is the time for a message."""
     lost = Key.MISSED if stage.is_ticker else Key.DROPPED
-    counts = {Key.RATE_HZ: rate_hz, Key.PROCESSED: stage.processed, lost: stage.dropped}
-    return {**counts, **times(status_names.WORK, stage.wall)}
+    work = times(status_names.WORK, stage.wall)
+    return {Key.RATE_HZ: rate_hz, Key.PROCESSED: stage.processed, lost: stage.dropped, **work}
 
 
 def rig_stats(health: RigHealth) -> Stats:
     """Return the state of the rig, and the evidence of the newest finding."""
     stats = {Key.STATE: health.state, "views": len(health.views), "needed_views": VIEWS}
-    if warning := health.warning:
-        stats["_error" if health.state.is_contradicted else "_warning"] = warning
-    elif health.state is RigState.FITS:
-        stats["_words"] = "fits"
-    else:
-        stats["_words"] = "not checked yet: the robot must drive past different places"
+    stats["_error" if health.state.is_contradicted else "_warning"] = health.warning
     if (found := health.finding) is not None:
         stats |= {name: getattr(found, name) for name in ("turn_deg", "left_px", "matches", "tried")}
     return stats
@@ -200,4 +188,4 @@ def image_stats(newest: OdometryUpdate | None) -> Stats:
         if columns.any():
             where = "all around" if columns.all() else "in a part of its view"
             words.append(f"the {side} camera is {'frozen' if tiles.dead[side].any() else 'blind'} {where}")
-    return {"_error": "; ".join(words), "_words": status_names.LIVE}
+    return {"_error": "; ".join(words)}

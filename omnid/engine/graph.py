@@ -15,7 +15,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
 from functools import partial
 from types import FrameType
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
@@ -93,16 +92,6 @@ class _Node:
                     self.stream.push(result)
 
 
-@dataclass(slots=True, eq=False)
-class _Link:
-    """One of the streams that a node reads, with what waits of it and the bound of that."""
-
-    node: _Node
-    depth: int
-    drops: bool
-    waiting: deque[object] = field(default_factory=deque)
-
-
 class _Inbox:
     """Bounded queues in front of a thread, from which it serves its nodes in the order of arrival.
 
@@ -111,37 +100,43 @@ class _Inbox:
     """
 
     def __init__(self, graph: Graph) -> None:
-        self.nodes: set[_Node] = set()
         self._graph, self._changed = graph, threading.Condition(graph.lock)
-        self._order: deque[_Link] = deque()
+        self._order: deque[tuple[_Node, deque[object]]] = deque()
+        self._open = 0  # streams that have not ended
 
-    def put(self, link: _Link, message: object) -> None:
-        """Add a message of a stream; the end of one always has room."""
-        waiting = link.waiting
-        with self._changed:
-            if message is not END and not link.drops:
-                self._changed.wait_for(lambda: len(waiting) < link.depth)
-            if waiting and waiting[-1] is END:  # from outside: it would take the place of the end
-                link.node.stats.dropped += 1
-                return
-            waiting.append(message)
-            if message is not END and len(waiting) > link.depth:
-                waiting.popleft()
-                link.node.stats.dropped += 1
-                return
-            self._order.append(link)
-            self._graph.waiting += 1
-            self._changed.notify_all()
+    def reader(self, node: _Node, depth: int, *, drops: bool) -> Callable[[object], None]:
+        """Return the function that adds a message of a stream for a node; the end of one always has room."""
+        waiting = deque[object]()
+        self._open += 1
+
+        def put(message: object) -> None:
+            with self._changed:
+                if message is not END and not drops:
+                    self._changed.wait_for(lambda: len(waiting) < depth)
+                if waiting and waiting[-1] is END:  # from outside: it would take the place of the end
+                    node.stats.dropped += 1
+                    return
+                waiting.append(message)
+                if message is not END and len(waiting) > depth:
+                    waiting.popleft()
+                    node.stats.dropped += 1
+                    return
+                self._order.append((node, waiting))
+                self._graph.waiting += 1
+                self._changed.notify_all()
+
+        return put
 
     def serve(self) -> None:
-        """Pass the messages to their nodes until all streams of these have ended."""
-        while any(node.writers for node in self.nodes):
+        """Pass the messages to their nodes until all streams have ended."""
+        while self._open:
             with self._changed:
                 self._changed.wait_for(lambda: self._order)
-                link = self._order.popleft()
-                message = link.waiting.popleft()
+                node, waiting = self._order.popleft()
+                message = waiting.popleft()
                 self._changed.notify_all()
-            link.node.put(message)
+            self._open -= message is END
+            node.put(message)
             with self._graph.idle:
                 self._graph.waiting -= 1
                 if not self._graph.waiting:
@@ -218,9 +213,8 @@ class Graph:
                 stream.readers.append(node.put)
                 continue
             inbox = self._inboxes.setdefault(thread, _Inbox(self))
-            inbox.nodes.add(node)
-            link = _Link(node, stream.depth or depth or self._depth, self.drops or bool(stream.depth))
-            stream.readers.append(partial(inbox.put, link))
+            drops = self.drops or bool(stream.depth)
+            stream.readers.append(inbox.reader(node, stream.depth or depth or self._depth, drops=drops))
         return node.stream
 
     sink = stage
@@ -234,9 +228,9 @@ class Graph:
         """
         # 1. A thread for each source and each group of stages.
         bodies = self._readers | {name: inbox.serve for name, inbox in self._inboxes.items()}
-        threads = []
-        for name, body in bodies.items() if self.threaded else ():
-            threads.append(threading.Thread(target=self._begin, args=(name, body), name=name))
+        if not self.threaded:
+            bodies = {}
+        threads = [threading.Thread(target=self._begin, args=body, name=body[0]) for body in bodies.items()]
         # 2. Run, and wait for the end of all.
         try:
             for thread in threads:

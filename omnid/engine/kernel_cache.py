@@ -19,28 +19,24 @@ def prepare_kernels(report: Report = log) -> None:
     modules = kernel_modules()
     if problem := why_unusable(cache_folder()):
         raise OmnidError(f"compiled functions cannot be kept in {cache_folder()}: {problem}: set OMNID_CACHE_DIR")
+    # 1. New folders for the code of files that have none, without that of their earlier states.
     missing = [name for name in modules if not is_kept(name)]
     if missing:
         report(logging.INFO, "compiling the loops over pixels and landmarks for this processor, once; takes a minute")
-    try:
-        _compile(modules, missing)
-    except Exception:  # what pickle and LLVM raise for files that a power cut has damaged
-        report(logging.WARNING, "what was compiled earlier is damaged, and compiled again; takes a minute")
-        for name in modules:
-            shutil.rmtree(code_folder(name), ignore_errors=True)
-        _compile(modules, modules)
-
-
-def _compile(modules: list[str], missing: list[str]) -> None:
-    """Compile the functions that are not ready, those of missing modules into new folders."""
     for name in missing:
         folder = code_folder(name)
         for found in folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*"):
             if found != folder or not is_kept(name):  # of an earlier state of the file, or others could write to it
                 shutil.rmtree(found, ignore_errors=True)
         folder.mkdir(mode=0o700, exist_ok=True)  # another program that has just begun may have made it
-    for name in modules:
-        import_module(name)
-    for kernel in DECLARED:
-        if kernel.function.__module__ in modules:
-            kernel.compile(is_kept=True)
+    # 2. The code.
+    try:
+        for name in modules:
+            import_module(name)
+        for kernel in DECLARED:
+            if kernel.function.__module__ in modules:
+                kernel.compile(is_kept=True)
+    except Exception as error:  # what pickle and LLVM raise for files that a power cut has damaged
+        for name in modules:
+            shutil.rmtree(code_folder(name), ignore_errors=True)
+        raise OmnidError("what was compiled earlier is damaged; it is deleted now: start again") from error

@@ -53,17 +53,14 @@ class RobotClock:
                 self._offsets.append((now_ns, offset_ns))
             if not is_step:
                 return
-            how = f"was set {'forwards' if change_ns > 0 else 'back'} by {abs(change_ns) * S_PER_NS:.3f} s"
             self.steps, self._step_at_ns, self._step_s = self.steps + 1, now_ns, change_ns * S_PER_NS
+        how = f"was set {'forwards' if change_ns > 0 else 'back'} by {abs(change_ns) * S_PER_NS:.3f} s"
         self._report(f"the computer's clock {how}: stamps follow it, a recording goes on in a new file")
 
     def _measured(self) -> tuple[int, int, int]:
-        """Return the largest error of an offset, the offset, and the time of both [ns]; of three the most exact one."""
-        readings = []
-        for _ in range(3):
-            before_ns, unix_ns, after_ns = self.monotonic_ns(), self._unix_ns(), self.monotonic_ns()
-            readings.append((after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2, after_ns))
-        return min(readings)
+        """Return the largest error of an offset, the offset, and the time of both [ns]."""
+        before_ns, unix_ns, after_ns = self.monotonic_ns(), self._unix_ns(), self.monotonic_ns()
+        return after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2, after_ns
 
     def _offset_ns(self, stamp_ns: int) -> int:
         """Return the offset from a stamp to Unix time, as it was last measured before the stamp."""

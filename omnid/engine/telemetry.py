@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, TypeVar
 
 from omnid.core.nanoseconds import S_PER_NS
 
@@ -37,18 +37,7 @@ class Histogram:
 
     def times_ms(self) -> dict[str, float]:
         """Return median, 99th percentile and maximum, ms; NaN before the first."""
-        return {"p50": 1e3 * self.p(0.5), "p99": 1e3 * self.p(0.99), "max": 1e3 * self.max_s}
-
-
-class SummaryRow(NamedTuple):
-    """One printed line: wall time per message in milliseconds, NaN if no message was processed."""
-
-    stage: str
-    n: int
-    drops: int
-    p50_ms: float
-    p99_ms: float
-    max_ms: float
+        return {"p50_ms": 1e3 * self.p(0.5), "p99_ms": 1e3 * self.p(0.99), "max_ms": 1e3 * self.max_s}
 
 
 @dataclass(slots=True)
@@ -98,6 +87,6 @@ class Telemetry:
         """Return the number of messages that were dropped in front of stages and sinks, or of missed deadlines."""
         return sum(stats.dropped for stats in self.stages if stats.is_ticker == by_tickers)
 
-    def summary(self) -> list[SummaryRow]:
-        """Return one row per stage, for printing."""
-        return [SummaryRow(one.name, one.processed, one.dropped, *one.wall.times_ms().values()) for one in self.stages]
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return n (messages), drops, p50_ms, p99_ms and max_ms (time of one, NaN without any) by stage."""
+        return {one.name: {"n": one.processed, "drops": one.dropped, **one.wall.times_ms()} for one in self.stages}

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from calib.rig_file import rig_toml
 from omnid.config import Config
@@ -27,13 +26,6 @@ from omnid.messages import NavigationUpdate, PlaceUpdate
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
 from omnid.transport.topics import MOST_OPEN, Answer, Answers
-
-
-class MapCopy(NamedTuple):
-    """A copy of the map that is to be written, and the ids of the requests for it."""
-
-    places: PlaceMap
-    ids: list[int]
 
 
 class RunPlaces:
@@ -79,41 +71,41 @@ class RunPlaces:
         # 2. What was saved, and requests for it.
         self.written: Path | None = None
         self._asked: deque[int] = deque(maxlen=MOST_OPEN)  # ids of requests
+        self._is_asked = False  # since the newest copy
         self._save_ns, self._copied_ns = round(settings.save_s * NS_PER_S), 0
-        self._is_writing = False
         self._saved = frozenset[int]()  # keyframes in the file
         self._saves, self._error = 0, ""  # number of saves; what the last one failed by
 
     def ask(self, id: int) -> None:
         """Have the map written, and the request with this id answered; from any thread."""
         self._asked.append(id)
+        self._is_asked = True
 
-    def copy(self, update: PlaceUpdate) -> MapCopy | None:
-        """Return a copy of the map after a pose, where it is due or was asked for and none is being written."""
+    def copy(self, update: PlaceUpdate) -> PlaceMap | None:
+        """Return a copy of the map after a pose, where it is due or was asked for."""
         self._copied_ns = self._copied_ns or update.stamp_ns
-        is_due = self._save_ns and update.stamp_ns - self._copied_ns >= self._save_ns
-        if self.places is None or self._is_writing or not (self._asked or is_due):
+        is_due = self._is_asked or update.stamp_ns - self._copied_ns >= self._save_ns
+        if self.places is None or not is_due:
             return None
-        self._is_writing, self._copied_ns = True, update.stamp_ns
-        ids = [self._asked.popleft() for _ in range(len(self._asked))]
-        return MapCopy(self.places.part(self.places.keyframes), ids)
+        self._is_asked, self._copied_ns = False, update.stamp_ns
+        return self.places.part(self.places.keyframes)
 
-    def write(self, copy: MapCopy) -> Answers:
-        """Write the joined part of a copy, where it is new; return the answers to the requests for it."""
-        joined = self._joined(copy.places)
+    def write(self, places: PlaceMap) -> Answers:
+        """Write the joined part of a copy, where it is new; return the answers to the requests so far."""
+        ids = [self._asked.popleft() for _ in range(len(self._asked))]
+        joined = self._joined(places)
         answer, self._error = Answer(True, "the map in the file has all that is known already"), ""
         if joined - self._known and joined != self._saved:
             try:
-                self._write(copy.places.part(joined))
+                self._write(places.part(joined))
                 self._saved, self._saves, answer = joined, self._saves + 1, Answer(True, "the map is saved")
             except OmnidError as error:
                 self._error, answer = str(error), Answer(False, f"the map is not saved: {error}")
-        self._is_writing = False
-        return dict.fromkeys(copy.ids, answer)
+        return dict.fromkeys(ids, answer)
 
     def stats(self) -> dict[str, object]:
         """Return how often the map was saved, and why it is not."""
-        return {"saves": self._saves, "_error": self._error, "_words": "saves the map"}
+        return {"saves": self._saves, "_error": self._error}
 
     def finish_run(self) -> None:
         """Write the joined part of the map to its file after the run, if it was extended.

@@ -40,7 +40,7 @@ from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER, Report, log
 from omnid.engine.process import prepare, start_thread
 from omnid.engine.robot_clock import RobotClock, fixed_offset
-from omnid.engine.telemetry import Histogram, Telemetry
+from omnid.engine.telemetry import Telemetry
 from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.plain_text import one_line
 from omnid.runs.files import RunPlaces
@@ -51,7 +51,7 @@ from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.encoder import Encoder
 from omnid.sinks.recorder import Recorder
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.obstacles import ADVICE, controller_scan
+from omnid.stages.obstacles import FLOOR_WARNING, controller_scan
 from omnid.stages.synchronise import MotionInbox
 from omnid.transport import status_names as names
 from omnid.transport import topics
@@ -150,10 +150,7 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
         run_places = _join(session, FrontEnd(geometry, config, health), robot, report)
         if geometry.rig.height_m(config.obstacles.scan.floor_m) is None:
-            warn(
-                "the rig states no height of the cameras: the floor is looked for in the images; "
-                f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
-            )
+            warn(FLOOR_WARNING)
         # 3. The status line of systemd and of a terminal.
         outputs.callback(HANDLER.show, "")
         outputs.callback(notify, "STOPPING=1", "STATUS=stopping")
@@ -185,14 +182,11 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
             bus.answer(id, words)
 
     # 2. Who takes what the stages make.
-    to_pose, reports = Histogram(), graph.inlet(1)  # time from the images to their pose [s], and the status
+    reports = graph.inlet(1)  # the status
     exposure = ExposureControl(UsefulArea(rig, front_end.geometry.cylinder), config.cameras, robot.states)
     outputs = Outputs(
         pairs={"exposure": exposure},
-        counters={
-            "statistics": statistics,
-            "latency": lambda pose: to_pose.add((clock.monotonic_ns() - pose.stamp_ns) * S_PER_NS),
-        },
+        counters={"statistics": statistics},
         answers=answer,
         # The ticks of wheels that wait give the time.
         bus=BusSink(bus, session.encoder(rig), clock=VelocityCommand if robot.waits else None),
@@ -265,13 +259,12 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
     if controller is not None:
         session.parts[names.WHEELS] = partial(wheel_stats, controller.statistics, commands)
         session.parts[names.REQUESTS] = commands.requests.stats
-    for name, part in ((names.PLACES, stages.places), (names.FLOOR, stages.floor)):
-        if part is not None:
-            session.parts[name] = part.stats
+    if stages.places is not None:
+        session.parts[names.PLACES] = stages.places.stats
     if run_places.saves:
         session.parts[names.MAP_FILE] = run_places.stats
     collect = StatusCollector(
-        graph.telemetry, robot.states, front_end.pairing, statistics, to_pose, session.parts, clock.monotonic_ns
+        graph.telemetry, robot.states, front_end.pairing, statistics, session.parts, clock.monotonic_ns
     )
     session.every(
         config.live.status_s,

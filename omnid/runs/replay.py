@@ -28,7 +28,6 @@ from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warn
 from omnid.diagnostics.status import stage_stats
 from omnid.engine.graph import Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.telemetry import SummaryRow
 from omnid.engine.threads import POLL_S, sleep_until
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
@@ -46,6 +45,7 @@ from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
+from omnid.stages.obstacles import FLOOR_WARNING
 from omnid.stages.synchronise import MotionInbox
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import Diagnostics
@@ -99,7 +99,7 @@ class RunResult:
     covariances: NDArray[np.float64]  # (N, 6, 6) of the poses, [t; r] in the axes of the rig, m^2 and rad^2
     states: tuple[TrackingState, ...]  # (N,)
     counters: RunCounters
-    timings: Mapping[str, SummaryRow]  # by stage: messages, drops, p50, p99 and maximum of the time of one [ms]
+    timings: Mapping[str, Mapping[str, float]]  # by stage: n (messages), drops, p50_ms, p99_ms and max_ms of one
     warnings: tuple[str, ...]  # doubts about the input and what to do about them, one line each
     map: MapPoints | None  # points (M, 3) m in odom, with confidence, frames and age; None without a pair
     signal: int = 0  # number of the signal that ended the run early; 0: it came to its end
@@ -265,7 +265,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             np.array([pose[2] for pose in poses], np.float64).reshape(-1, 6, 6),
             tuple(pose[3] for pose in poses),
             counters,
-            {row.stage: row for row in graph.telemetry.summary()},
+            graph.telemetry.summary(),
             (*dict.fromkeys(warnings), *_about_input(session, reader, front_end, stages, counters)),
             newest_map[0].points if newest_map else None,
             graph.signal,
@@ -306,7 +306,8 @@ def _about_input(
     message = entry(MOTION, front_end.motion_stats()).message if motion.wheels or motion.gyro else ""
     if message and not (fault.reason and message.startswith(fault.reason)):
         yield f"wheels and gyro: {message}"
-    if stages.floor is not None and stages.floor.summary():
-        yield stages.floor.summary()
+    config, rig = session.config, front_end.geometry.rig
+    if (stages.places or stages.obstacles) and rig.height_m(config.obstacles.scan.floor_m) is None:
+        yield FLOOR_WARNING
     yield from front_end.image_faults
-    yield from input_warnings(front_end.pairing, front_end.health, session.statistics, session.config)
+    yield from input_warnings(front_end.pairing, front_end.health, session.statistics, config)

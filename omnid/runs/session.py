@@ -73,8 +73,7 @@ class Session:
     ) -> None:
         """warn: takes a line for the user; clock: that of the stamps of the frames, None: they are Unix time."""
         self.config, self.graph, self.outputs, self.warn = config, graph, outputs, warn
-        self.clock = clock or log_time()
-        self.statistics = RunStatistics()
+        self.clock, self.statistics = clock or log_time(), RunStatistics(clock)
         self.parts: dict[str, Callable[[], Stats]] = {}  # numbers of the parts of a live run, by their names
 
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:

@@ -18,12 +18,12 @@ from omnid.engine.graph import Graph, Output, Stream
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.files import RouteFiles, RunPlaces
-from omnid.sinks.drive import LiveDrive, LockstepDrive, navigation_answers, planner_setpoint
+from omnid.sinks.drive import LiveDrive, navigation_answers, planner_setpoint
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.mapping import MapGrid, Mapping
 from omnid.stages.navigation import NavigationStage
-from omnid.stages.obstacles import CameraFloor, Obstacles
+from omnid.stages.obstacles import Obstacles
 from omnid.stages.places import Places
 from omnid.transport.codec import Diagnostics
 from omnid.transport.topics import MOST_OPEN, Answers
@@ -38,7 +38,7 @@ class Inputs:
 
     frames: Sequence[Stream[Frame | MotionSample]] | Sequence[Stream[Frame]]
     map: RunPlaces  # of places, to begin with, and its file
-    controller: DriveLink | None = None  # that drives; None: the law in lock-step gives the commands
+    controller: DriveLink | None = None  # of a live run; its commands leave the run
     # Requests to the navigation, and the states of the controller; None: the run does not navigate.
     navigation: tuple[Stream[NavigationCommand], Stream[ControllerState]] | None = None
     reports: Stream[Diagnostics] | None = None  # the status of a live run, whose images are recorded as well
@@ -66,7 +66,7 @@ class WiredStages(NamedTuple):
 
     mapping: Mapping | None
     places: Places | None
-    floor: CameraFloor | None  # that the run uses; None where it needs none
+    obstacles: Obstacles | None
 
 
 def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outputs: Outputs) -> WiredStages:
@@ -81,7 +81,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     T_base_rect = T_base_rig @ geometry.T_rig_rect
     takes_all = outputs.bus is not None or outputs.recorder is not None
     mapping, places, obstacles = None, None, None
-    maps, in_map, grids, scans, ways = None, None, None, None, None
+    commands, maps, in_map, grids, scans, ways = None, None, None, None, None, None
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *inputs.frames)
@@ -92,9 +92,6 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     if controller is not None:
         graph.sink("controller", LiveDrive(controller, T_base_rig), poses, thread=poses.thread)
         commands = graph.source("drive", controller.commands, wake=controller.end)
-    else:
-        law = LockstepDrive(config.controller, 1.0 / config.motor.rate_hz, T_base_rig)
-        commands = graph.stage("drive", law, poses, thread=poses.thread)
 
     # 3. Poses give the map, the pose in it, and the obstacles, where these are consumed.
     if outputs.maps or takes_all:
@@ -167,8 +164,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
     graph.sink("keyframes", lambda _: front_end.complete(), poses, thread=poses.thread)
-    user = places or obstacles
-    return WiredStages(mapping, places, None if user is None else user.floor)
+    return WiredStages(mapping, places, obstacles)
 
 
 def wheel_state(state: ControllerState) -> WheelState:

@@ -79,8 +79,7 @@ class PacedRobot:
         """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
         passed_ns = self.clock_ns() - self._start_ns
         factor = round(passed_ns / max(1, time.monotonic_ns() - self._first_ns), 2)
-        words, time_s = "its time waits for the daemon", passed_ns * S_PER_NS
-        return {Key.REAL_TIME_FACTOR: factor, "time_s": time_s, "contacts": self.contacts, "_words": words}
+        return {Key.REAL_TIME_FACTOR: factor, "time_s": passed_ns * S_PER_NS, "contacts": self.contacts}
 
     def close(self) -> None:
         """End the images; from any thread."""

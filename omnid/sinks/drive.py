@@ -1,9 +1,4 @@
-"""What brings poses to the controller, on the robot and in a replay.
-
-`omnid run` and `omnid replay --motor` step the control law in the controller process, in real time. LockstepDrive steps
-it on the stamps of the log, so that what a replay publishes and records as `<robot>/drive` is a function of log and
-configuration alone: inline or not, with and without --motor, the bytes are the same.
-"""
+"""What brings poses and setpoints to the controller, on the robot and in a replay."""
 
 from __future__ import annotations
 
@@ -16,13 +11,11 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.errors import DriverError
-from drivers.motor import VelocityCommand
 from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.control.arming import PLANNER, TimedSetpoint
-from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings, ControlOutput
-from omnid.core.control.heading_controller import STOP, Setpoint
+from omnid.core.control.control_law import ControllerPose
+from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
-from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, OdometryUpdate
 from omnid.tracking_state import TrackingState
@@ -103,42 +96,6 @@ class ReplayDrive:
         """Return the commands that were answered, the errors, and how often moving wheels had to stop."""
         state = self._link.statistics.state
         return {"commands": state.sent, "errors": state.errors, "stops": state.stops.total()}
-
-
-class LockstepDrive:
-    """Follow the setpoint of the configuration with the base that carries the rig.
-
-    The law ticks at the motor's rate between two poses as well, so that a gap in the log stops the wheels as it does
-    on the robot: after controller.deadlines.pose_s, within the deceleration.
-    """
-
-    def __init__(self, settings: ControllerSettings, period_s: float, T_base_rig: NDArray[np.float64]) -> None:
-        """period_s: between two ticks."""
-        self._setpoint, self._T_base_rig = settings.setpoint.setpoint(), T_base_rig
-        self._period_ns = round(period_s * NS_PER_S)
-        self._law = ControlLaw(settings.of_replay, start_ns=-1)
-        self._last_ns: int | None = None
-
-    def process(self, odometry: OdometryUpdate) -> VelocityCommand:
-        """Return the command that follows from a pose, at its stamp."""
-        # 1. The ticks since the last pose; none once the wheels are at rest.
-        stamp_ns = odometry.stamp_ns
-        ticks = range(stamp_ns if self._last_ns is None else self._last_ns, stamp_ns, self._period_ns)[1:]
-        for tick_ns in ticks:
-            output = self._step(tick_ns)
-            if output.reason and output.motion == STOP:
-                self._last_ns = ticks[-1]
-                break
-        # 2. The tick at this pose, whose command is recorded.
-        self._law.take(controller_pose(odometry, self._T_base_rig))
-        output = self._step(stamp_ns)
-        return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
-
-    def _step(self, now_ns: int) -> ControlOutput:
-        dt_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * S_PER_NS
-        self._last_ns = now_ns
-        self._law.take(TimedSetpoint(now_ns, self._setpoint))
-        return self._law.step(now_ns, dt_s)
 
 
 def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -> ControllerPose:

@@ -31,7 +31,10 @@ from omnid.tracking_state import TrackingState
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-ADVICE: Final = "state it by `omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
+FLOOR_WARNING: Final = (
+    "the rig states no height of the cameras: the floor is looked for in the images, and map, grid and obstacles call "
+    "nothing free before it is found; state it by `omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
+)
 
 
 class CameraFloor:
@@ -64,22 +67,6 @@ class CameraFloor:
     def T_floor_rig(self, floor: Floor) -> Array:
         """Return the transform (4, 4) from the rig to the level frame of the base, with the floor at z = 0."""
         return np.asarray(floor.T_floor_base(self.view) @ self._T_base_rig)
-
-    def stats(self) -> dict[str, object]:
-        """Return the figures of the floor, where it is known, and what is wrong."""
-        floor = self.floor
-        figures: dict[str, object] = {}
-        if floor is not None:  # height of the lower viewpoint
-            tilt_deg = math.degrees(floor.tilt_rad)
-            figures = {"height_m": floor.height_m, "sigma_m": floor.sigma_m, "tilt_deg": tilt_deg}
-        return figures | {"_warning": self.summary(), "_words": "the rig states the height of the cameras"}
-
-    def summary(self) -> str:
-        """Return one sentence about a height that the rig does not state; empty where it does."""
-        if self.stated is not None:
-            return ""
-        found = "show the floor" if self.floor else "do not show the floor: map, grid and obstacles call nothing free"
-        return f"the rig does not state the height of the cameras, and the images {found}; {ADVICE}"
 
 
 # Scan of a pair while the floor is not known.

@@ -39,7 +39,6 @@ MAP_FILE: Final = f"{PREFIX}map file"
 NAVIGATION: Final = f"{PREFIX}navigation"  # on its own topic
 REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 IMAGES: Final = f"{PREFIX}images"  # parts of them that are frozen or blind
-FLOOR: Final = f"{PREFIX}floor"  # height of the cameras above it
 EXPOSURE: Final = f"{PREFIX}exposure"
 CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`
 SIMULATION: Final = f"{PREFIX}simulation"  # of a simulated robot whose time waits for the daemon
@@ -54,7 +53,6 @@ RUN_ID: Final = secrets.token_hex(4)  # of this program: one that starts again h
 TIMEOUT_S: Final = 1.0  # An older image of a camera, or an older pose, is reported as missing.
 # Share of the pairs that were dark, had lost parts, no sure pose or no place in a queue, from which there is a warning.
 NOTABLE_SHARE: Final = 0.1
-LIVE: Final = "all parts are live"  # of the images
 SAME_NAME: Final = (
     "another robot on the bus has this one's name, and both obey the same commands: this one is not armed before the "
     "other has gone; change bus.robot of one of them"
@@ -155,7 +153,6 @@ REMEDIES: Final[Mapping[str, str]] = {
     PLACES: "drive slowly to where the map was made; where everything has changed, make a new map",
     MAP_FILE: "make room on the disk, or change places.map",
     IMAGES: "clean the mirrors, look for glare and darkness, check the cameras and their driver",
-    FLOOR: "state the height of the cameras in the rig: omnid calibrate drive --only height",
     EXPOSURE: "in the dark switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the "
     "mirrors; in glare shade the mirrors, or put a filter before the lenses; where the images are good enough, set "
     'cameras.auto_exposure = "on"',
@@ -184,7 +181,7 @@ def times(name: str, histogram: Histogram) -> dict[str, float]:
     """Return median, 99th percentile and maximum in ms; nothing before the first measurement."""
     if not histogram.count:
         return {}
-    return {time_key(name, statistic): value_ms for statistic, value_ms in histogram.times_ms().items()}
+    return {f"{name}_{statistic}": value_ms for statistic, value_ms in histogram.times_ms().items()}
 
 
 def stage_name(stage: str) -> str:

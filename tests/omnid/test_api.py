@@ -110,7 +110,7 @@ def test_the_result_holds_arrays_counters_and_timings(result: omnid.RunResult) -
     assert len(result.warnings) == 1 and "height of the cameras" in result.warnings[0]  # the rig does not state it
     for stage in ("pair", "dewarp", "odometry", "mapping"):
         timing = result.timings[stage]
-        assert timing.n >= PAIRS and 0 < timing.p50_ms <= timing.p99_ms <= timing.max_ms
+        assert timing["n"] >= PAIRS and 0 < timing["p50_ms"] <= timing["p99_ms"] <= timing["max_ms"]
 
 
 def test_a_result_is_compared_with_the_truth(result: omnid.RunResult, tmp_path: Path) -> None:

@@ -24,7 +24,8 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.diagnostics.status import StatusCollector, image_stats, wheel_stats
-from omnid.engine.telemetry import Histogram, StageStats, Telemetry
+from omnid.engine.robot_clock import RobotClock
+from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.sinks.drive import controller_pose
 from omnid.stages.synchronise import Synchronise
@@ -32,7 +33,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.status_names import IMAGES, LIVE, REMEDIES, TIMEOUT_S, WHEELS, Key, entry, short_name
+from omnid.transport.status_names import IMAGES, REMEDIES, TIMEOUT_S, WHEELS, Key, entry, short_name
 from omnid.transport.topics import Request
 from tests.omnid.sinks.test_recorder import small_depth
 from tests.simulation import build
@@ -58,7 +59,7 @@ class Daemon:
     """The parts of a daemon whose status is collected."""
 
     def __init__(self, rig: Rig) -> None:
-        self.telemetry, self.statistics, self.to_pose = Telemetry(), RunStatistics(), Histogram()
+        self.telemetry, self.statistics = Telemetry(), RunStatistics(RobotClock())
         self.stages = [self.telemetry.add(StageStats(name)) for name in ("pair", "motor")]
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = Synchronise(rig, PairConfig())
@@ -71,7 +72,6 @@ class Daemon:
             self.cameras,
             self.pair,
             self.statistics,
-            self.to_pose,
             {WHEELS: partial(wheel_stats, self.controller_statistics, self.commands)},
         )
 
@@ -112,7 +112,6 @@ class Daemon:
             small_depth(),
         )
         self.statistics.process(odometry)
-        self.to_pose.add(age_s)
         self.controller.take(controller_pose(odometry, np.eye(4)))
 
     def tick(self) -> None:
@@ -234,4 +233,4 @@ def test_names_the_camera() -> None:
     frozen = entry(IMAGES, image_stats(update(lost(0, TILE_COLUMNS, is_dead=True), 114 * S)))
     assert frozen.message == "the upper camera is frozen all around"
     live = entry(IMAGES, image_stats(update(ALL_LIVE, 115 * S)))
-    assert (live.level, live.message) == (OK, LIVE)
+    assert (live.level, live.message) == (OK, "")

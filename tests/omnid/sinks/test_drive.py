@@ -1,4 +1,4 @@
-"""What the controller gets: the control law on the stamps of a log; rendered drives with a plausible motion or not."""
+"""What the controller gets of a pose; rendered drives with a plausible motion or not."""
 
 from __future__ import annotations
 
@@ -17,10 +17,8 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
-from drivers.motor import VelocityCommand
 from omnid import Odometry
-from omnid.core.control.control_law import ControllerSettings, ReplaySetpoint
-from omnid.core.control.heading_controller import Twist, VelocityLimits
+from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import (
     NOT_COMMANDED,
     NOT_SEEN,
@@ -29,20 +27,11 @@ from omnid.core.control.motion_monitor import (
     Plausibility,
     TrustSettings,
 )
-from omnid.core.control.safety_rules import Deadlines
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
-from omnid.sinks.drive import LockstepDrive, controller_pose
+from omnid.sinks.drive import controller_pose
 from omnid.tracking_state import TrackingState
 from tests.conftest import PAIRS
-
-PERIOD_S = 0.05
-POSE_S = 0.1  # between two poses
-LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.5, deceleration_mps2=1.0, yaw_rate_radps=0.8)
-
-
-def settings(velocity_mps: float = 0.3, heading_deg: float = 0.0) -> ControllerSettings:
-    return ControllerSettings(Deadlines(), LIMITS, ReplaySetpoint(velocity_mps, heading_deg))
 
 
 def odometry(
@@ -54,35 +43,6 @@ def odometry(
     return OdometryUpdate(
         0, 10**12 + round(at_s * 1e9), T_odom_rig, np.eye(6), velocity, 1e-4 * np.eye(6), state, 0, 99, 99, depth
     )
-
-
-def driven(drive: LockstepDrive, count: int, start_s: float = 0.0, **kwargs: Any) -> list[VelocityCommand]:
-    """Return the commands for poses every 0.1 s."""
-    return [drive.process(odometry(start_s + POSE_S * k, **kwargs)) for k in range(count)]
-
-
-def test_slows_down_where_the_pose_is_lost_and_drives_on_once_it_is_found() -> None:
-    drive = LockstepDrive(settings(), PERIOD_S, np.eye(4))
-    driven(drive, 20)
-    lost = [command.velocity_mps for command in driven(drive, 5, 2.0, state=TrackingState.LOST)]
-    assert lost == pytest.approx([0.25, 0.15, 0.05, 0.0, 0.0], abs=1e-6)
-    assert 0.0 < drive.process(odometry(2.5)).velocity_mps <= LIMITS.acceleration_mps2 * POSE_S + 1e-9
-
-
-@pytest.mark.parametrize(("gap_s", "speed_mps"), [(0.5, 0.3), (0.7, 0.175), (3.0, 0.025), (1e6, 0.025)])
-def test_a_gap_in_the_log_stops_the_wheels(gap_s: float, speed_mps: float) -> None:
-    """The pose is stale after 0.5 s, then the wheels slow down by 1 m/s^2; after the gap they start again."""
-    drive = LockstepDrive(settings(), PERIOD_S, np.eye(4))
-    driven(drive, 20)
-    command = drive.process(odometry(1.9 + gap_s))
-    assert command.velocity_mps == pytest.approx(speed_mps, abs=1e-6)
-
-
-def test_steers_the_base_and_not_the_rig() -> None:
-    """A rig that looks backwards on the base: where the rig has turned left about z, so has the base."""
-    T_base_rig = se3.exp(np.array([0, 0, 0, 0, 0, np.pi]))
-    drive = LockstepDrive(settings(heading_deg=math.degrees(0.5)), PERIOD_S, T_base_rig)
-    assert driven(drive, 3, heading_rad=0.5)[-1].yaw_rate_radps == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("odd", [{"heading_rad": math.nan}, {"rate_radps": math.nan}])
