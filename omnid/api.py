@@ -21,8 +21,8 @@ from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
 from omnid.config import Config, load_config, unused_settings
+from omnid.engine.graph import Lock
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
 from omnid.messages import DensePoints, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, RunResult, run_log

@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from difflib import get_close_matches
 from importlib import import_module
 from itertools import dropwhile, takewhile
 from operator import methodcaller
@@ -101,12 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with ExitStack() as handlers:  # of the time in which modules are loaded, when nothing is to be ended
         with suppress(ValueError):  # outside the main thread signals stay as they are
             handlers.enter_context(handle_stop_signals(lambda number, _: os._exit(128 + number)))
-        args, unknown = parser_of(words).parse_known_args(words)
-        if unknown:
-            names = [name.lstrip("-") for action in args.parser._actions for name in action.option_strings]
-            near = get_close_matches(unknown[0].lstrip("-").partition("=")[0], names, 1)
-            hint = f", did you mean --{near[0]}?" if near else ""
-            args.parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        args = parser_of(words).parse_args(words)
         from calib.errors import CalibError
         from drivers.errors import DriverError
         from omnid.engine.logging_setup import configure_logging, log

@@ -56,7 +56,7 @@ class DensePoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoDepth:
-    """Evidence of the depth of a pair: `stages.dense_depths` computes the dense depth from it."""
+    """Evidence of the depth of a pair: `stages.geometry.DenseDepths` computes the dense depth from it."""
 
     panoramas: Panoramas
     # The motion during the exposures, for which the depth is corrected; None: not known, or all pixels at once.

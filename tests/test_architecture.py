@@ -59,10 +59,7 @@ RULES = (
     Rule(
         "omnid",
         ("threading", "_thread"),
-        excepted=(
-            "omnid/engine/graph.py",
-            "omnid/engine/threads.py",
-        ),
+        excepted=("omnid/engine/graph.py",),
     ),
     Rule(
         "omnid",

@@ -22,9 +22,8 @@ from omnid.core.rig.rig_health import RigHealth, RigState, match
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate
-from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.geometry import Dewarp, Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 

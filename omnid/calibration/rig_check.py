@@ -25,8 +25,7 @@ from omnid.core.rig.rig_health import (
 )
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.stages.dewarp import Dewarp
-from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.geometry import Dewarp, geometry, with_rims
 from omnid.stages.synchronise import Decoder
 
 # Number of pairs that are used, spread over the log: some thousand matches of different places.

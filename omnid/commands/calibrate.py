@@ -32,7 +32,7 @@ from omnid.core.rig.rig_health import RigState
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError
-from omnid.runs.session import attached_rig
+from omnid.runs.wiring import attached_rig
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus import Bus
 from omnid.transport.codec import diagnostics_cdr

@@ -12,14 +12,14 @@ from typing import Final
 from omnid.commands import options
 from omnid.core.places import place_views
 from omnid.core.places.place_map import PlaceMap, PlaceRig
-from omnid.diagnostics.run_summary import Progress
+from omnid.diagnostics.status import Progress
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_grid, write_ply
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.plan import drawn_heights
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.files import check_outputs, write_plan
-from omnid.stages.obstacles import ADVICE
+from omnid.stages.obstacles import FLOOR_WARNING
 
 MAP: Final = "map FILE.omap  a map of places"
 
@@ -101,7 +101,7 @@ def export(args: argparse.Namespace) -> int:
     places, rig = read_places(args.map)
     if args.grid is not None:
         if not any(keyframe.free_m.any() for keyframe in places.keyframes.values()):
-            options.warn(f"{args.grid}: no cell is free, as the floor was not known: {ADVICE}, and build the map again")
+            options.warn(f"{args.grid}: no cell is free, as the floor was not known: {FLOOR_WARNING}")
         write_grid(args.grid, place_views.grid(places, rig, args.cell))
     if args.ply is not None:
         write_ply(args.ply, place_views.landmarks(places, rig, args.cell))

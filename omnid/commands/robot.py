@@ -18,7 +18,7 @@ from omnid.engine.logging_setup import HANDLER
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
-from omnid.monitor import navigation
+from omnid.monitor import robot_state
 from omnid.monitor.teleop import teleoperate
 from omnid.navigation_state import NavigationState
 from omnid.plain_text import utc
@@ -49,7 +49,7 @@ def stop(args: argparse.Namespace) -> int:
       stop --robot rover --connect tcp/robot:7447
     """
     bus = settings_of(args).bus
-    if navigation.stop(bus):
+    if robot_state.stop(bus):
         print(f"{bus.robot} stops: its wheels stay stopped until `omnid arm`")
         return 0
     print(f"{bus.robot} has not confirmed the stop: use the emergency stop if it drives")
@@ -120,7 +120,7 @@ def teach(args: argparse.Namespace) -> int:
         # 2. Show its length until Enter or Ctrl-C.
         try:
             while not select.select([sys.stdin], [], [], 0)[0]:
-                report = reports.wait(navigation.REPEAT_S)
+                report = reports.wait(robot_state.REPEAT_S)
                 if report is not None and report.teaching != name:
                     raise OmnidError(f"the recording of {name} has ended: {report.refusal or 'by another program'}")
                 if report is not None:
@@ -217,7 +217,7 @@ def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int
         try:
             with handle_stop_signals(signal.default_int_handler):
                 granted(robot, request(driver))
-                for report in navigation.reports_of(robot, driver.asked_ns):
+                for report in robot_state.reports_of(robot, driver.asked_ns):
                     if report.words != shown and report.command_ns == driver.asked_ns:
                         HANDLER.show("")
                         print(report.words, flush=True)

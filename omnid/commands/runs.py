@@ -21,7 +21,7 @@ from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.commands import options
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
-from omnid.diagnostics.run_summary import Progress, summary_entries, timing_table
+from omnid.diagnostics.status import Progress, summary_entries, timing_table
 from omnid.engine.graph import nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
@@ -30,7 +30,7 @@ from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.live import ConnectedRobot, record_frames, run_live
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.runs.session import attached_rig
+from omnid.runs.wiring import attached_rig
 from omnid.simulation.demonstration import demonstrate
 from omnid.simulation.paced_robot import PacedRobot
 from omnid.simulation.robot import make_robot

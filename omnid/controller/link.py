@@ -26,10 +26,8 @@ from omnid.controller.ipc import (
 from omnid.core.control.arming import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.graph import Stream
+from omnid.engine.graph import POLL_S, Histogram, StageStats, Stream
 from omnid.engine.process import python, python_environment
-from omnid.engine.telemetry import Histogram, StageStats
-from omnid.engine.threads import POLL_S
 from omnid.errors import OmnidError
 
 START_S: Final = 30.0  # of the process, beyond the time in which the motor controller may boot

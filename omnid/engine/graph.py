@@ -8,22 +8,27 @@ Where streams of several threads merge, only the inline order is fixed.
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+import sys
 import threading
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from types import FrameType
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.process import handle_stop_signals
-from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.engine.threads import POLL_S
 
+Lock = threading.Lock
+POLL_S: Final = 0.1  # longest wait without a look at what ends it, as a signal in another thread wakes no main thread
+RECENT: Final = 1000  # durations whose distribution is known: ten seconds of the controller's ticks
 T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
@@ -31,6 +36,119 @@ T_co = TypeVar("T_co", covariant=True)
 Out_co = TypeVar("Out_co", covariant=True)
 In_contra = TypeVar("In_contra", contravariant=True)
 END: Final = object()  # the last message of a stream
+
+
+def started(action: Callable[[], object], name: str) -> threading.Thread:
+    """Call an action in a thread, which does not keep the program from ending; what it raises is printed."""
+    thread = threading.Thread(target=action, name=name, daemon=True)
+    thread.start()
+    return thread
+
+
+def sleep_until(due_ns: int, is_over: Callable[[], bool]) -> None:
+    """Sleep until a time by CLOCK_MONOTONIC, or until is_over() returns True."""
+    while not is_over() and (left_s := (due_ns - time.monotonic_ns()) * S_PER_NS) > 0:
+        time.sleep(min(left_s, POLL_S))  # half the processor time of a wait for an event
+
+
+class Poller:
+    """Calls an action each period until it is closed; what the action raises is printed, and the calls go on."""
+
+    def __init__(self, action: Callable[[], object], period_s: float, name: str) -> None:
+        self._action, self._period_ns = action, round(period_s * NS_PER_S)
+        self._closing = False
+        self._thread = started(self._run, name)
+
+    def close(self) -> None:
+        """End the calls; a running one ends first, unless this is it."""
+        self._closing = True
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closing:
+            due_ns = time.monotonic_ns() + self._period_ns
+            try:
+                self._action()
+            except Exception:  # the thread is the only way in for stops: it must not end by a defect elsewhere
+                traceback.print_exc(file=sys.stderr)
+            sleep_until(due_ns, lambda: self._closing)
+
+
+class Histogram:
+    """Distribution of the newest durations [s], their number, and the longest of all; one thread adds, any reads."""
+
+    def __init__(self) -> None:
+        self._recent_s: deque[float] = deque(maxlen=RECENT)
+        self.count = 0
+        self.max_s = math.nan
+
+    def add(self, duration_s: float) -> None:
+        """Add one duration."""
+        self._recent_s.append(duration_s)
+        self.max_s = duration_s if self.count == 0 else max(self.max_s, duration_s)
+        self.count += 1
+
+    def p(self, q: float) -> float:
+        """Return the quantile q (0 to 1) of the newest durations, s; NaN before the first."""
+        found_s = sorted(self._recent_s.copy())
+        return found_s[max(0, math.ceil(q * len(found_s)) - 1)] if found_s else math.nan
+
+    def times_ms(self) -> dict[str, float]:
+        """Return median, 99th percentile and maximum, ms; NaN before the first."""
+        return {"p50_ms": 1e3 * self.p(0.5), "p99_ms": 1e3 * self.p(0.99), "max_ms": 1e3 * self.max_s}
+
+
+@dataclass(slots=True)
+class StageStats:
+    """Counters of one stage, source, sink or ticker: written by its own thread, `dropped` under its inbox's lock.
+
+    A source's durations are the waits for its next message; a ticker's `dropped` are missed deadlines.
+    `busy_since_ns` (CLOCK_MONOTONIC): since when a message is processed, or a ticker acts; 0 when idle.
+    """
+
+    name: str
+    is_ticker: bool = False
+    processed: int = 0
+    dropped: int = 0
+    busy_since_ns: int = 0
+    wall: Histogram = field(default_factory=Histogram)
+
+    def timed(self, call: Callable[..., T], *args: Any) -> T:
+        """Return `call(*args)`, counted and timed; a call that raises is not counted."""
+        start_ns = self.busy_since_ns = time.monotonic_ns()
+        try:
+            result = call(*args)
+        finally:
+            self.busy_since_ns = 0
+        self.wall.add((time.monotonic_ns() - start_ns) * S_PER_NS)
+        self.processed += 1
+        return result
+
+
+class Telemetry:
+    """Registry of all counters of a run, in the order of the wiring."""
+
+    def __init__(self) -> None:
+        self.stages: list[StageStats] = []
+
+    def add(self, stats: StageStats) -> StageStats:
+        """Register the counters, whose name is that of no other stage, and return them."""
+        assert stats.name not in [other.name for other in self.stages], stats.name
+        self.stages.append(stats)
+        return stats
+
+    def of(self, name: str) -> StageStats:
+        """Return the counters of a stage; StopIteration without it."""
+        return next(stats for stats in self.stages if stats.name == name)
+
+    def lost(self, *, by_tickers: bool) -> int:
+        """Return the number of messages that were dropped in front of stages and sinks, or of missed deadlines."""
+        return sum(stats.dropped for stats in self.stages if stats.is_ticker == by_tickers)
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return n (messages), drops, p50_ms, p99_ms and max_ms (time of one, NaN without any) by stage."""
+        return {one.name: {"n": one.processed, "drops": one.dropped, **one.wall.times_ms()} for one in self.stages}
 
 
 class Stage(Protocol[In_contra, Out_co]):

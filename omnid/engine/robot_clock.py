@@ -19,8 +19,7 @@ from collections.abc import Callable
 from typing import Final
 
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
-from omnid.engine.graph import nothing
-from omnid.engine.threads import Lock
+from omnid.engine.graph import Lock, nothing
 
 STEP_NS: Final = 1_000_000  # less than two images of a pair are apart, more than NTP slews in a second
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does

@@ -11,23 +11,30 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import closing, nullcontext
 from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 
-from omnid.client import Robot
+from omnid.client import ANSWER_S, HERE, NavigationReport, Robot
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
+from omnid.navigation_state import NavigationState
 from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
 from omnid.transport.session import PERIOD_S, BusConfig
-from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key, short_name
+from omnid.transport.status_names import DISARMED_BY_STOP, SIMULATION, STAGE_PREFIX, WHEELS, Key, short_name
+from omnid.transport.stop_datagram import STOPPED, StopSender
 from omnid.transport.topics import PUBLISHED
 
 LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
 _INBOX_DEPTH: Final = 2000
 _RECENT: Final = 100  # poses
+
+SILENCE_S: Final = ANSWER_S  # A robot that sends no report for this time counts as gone.
+# Time between two stops over the bus, and until the first: a datagram without an answer by then is behind a router.
+REPEAT_S: Final = 0.15
 
 
 class ReceivedMessage(NamedTuple):
@@ -202,3 +209,52 @@ def status_table(robot: str, state: RobotState) -> Iterator[str]:
     for status in sorted(state.statuses.values(), key=importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
         yield f"  {LEVELS[status.level % len(LEVELS)]:7s} {short_name(status.name):16s} {status.message}  {values}"
+
+
+def reports_of(robot: Robot, command_ns: int) -> Iterator[NavigationReport]:
+    """Yield the reports of the drive that a request with this stamp began, and last the one with which it ended.
+
+    That is one of another request where that has taken the place of this one. Raise OmnidError where the robot is
+    silent for SILENCE_S.
+    """
+    begun, deadline_s = False, time.monotonic() + SILENCE_S
+    with robot.subscribe(NavigationReport) as reports:
+        while (report := reports.wait(deadline_s - time.monotonic())) is not None:
+            is_own = report.command_ns == command_ns
+            if is_own:
+                begun, deadline_s = True, time.monotonic() + SILENCE_S
+            if begun:
+                yield report
+                if not is_own or NavigationState(report.state).is_end:
+                    return
+    raise OmnidError(
+        f"{robot.name} has been silent for {SILENCE_S:g} s: look at it; if only the network between is gone, it drives "
+        "on (`omnid stop`, `omnid listen`)"
+    )
+
+
+def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = None) -> bool:
+    """Stop the robot, and go on until its status confirms it; False where it has not in time.
+
+    It goes as a datagram first, which needs no place among the sessions of the bus, and over the bus where that is not
+    answered: over a connection that there is, else over a new one. Raise OmnidError where the robot cannot be reached.
+    """
+    deadline_s = time.monotonic() + answer_s
+    with closing(StopSender(bus.robot, bus.connect or (HERE,))) as datagrams:
+        if datagrams.ask(REPEAT_S):
+            return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
+        with (
+            nullcontext(connection) if connection else Robot(settings=bus) as robot,
+            robot.subscribe(Diagnostics) as statuses,
+        ):
+            driver = robot.driver()
+            driver.require_connected()
+            statuses.newest()  # The one that the robot has kept is from before this stop.
+            while time.monotonic() < deadline_s:
+                driver.stop()
+                report = statuses.wait(REPEAT_S)
+                if report is not None and report.value(WHEELS, Key.DISARMED_BY) == DISARMED_BY_STOP:
+                    return True
+                if datagrams.ask(0.0) == STOPPED:
+                    return True
+    return False

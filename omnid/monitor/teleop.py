@@ -36,7 +36,6 @@ _SIDES: Final = {b"A": (0, 1), b"B": (0, -1), b"D": (1, 1), b"C": (1, -1)}  # ax
 ARROWS: Final = {begin + letter: side for letter, side in _SIDES.items() for begin in (b"\x1b[", b"\x1bO")}
 # One key: a whole escape sequence (ECMA-48, 5.4, without intermediate bytes, of which the space is one), or a byte.
 _KEY: Final = re.compile(rb"\x1b(?:\[[0-?]{0,16}|O)[@-~]|.", re.DOTALL)
-_BEGUN: Final = re.compile(rb"\x1b(?:\[[0-?]{0,16}|O)?\Z")  # a sequence whose end has not come yet
 
 
 @dataclass
@@ -48,29 +47,23 @@ class Stick:
     stop_asked: bool = False
     arm_asked: bool = False
     quit: bool = False
-    _begun: bytes = b""  # first bytes of a key whose others have not come yet
     _axes: list[tuple[int, float]] = field(default_factory=lambda: [(0, -math.inf), (0, -math.inf)])
 
     def press(self, data: bytes, now_s: float) -> None:
-        """Take the bytes of the keys pressed until now_s; those of one key may come in parts."""
-        data = self._begun + data
-        begun = _BEGUN.search(data)
-        self._begun = begun[0] if begun else b""
-        for key in _KEY.findall(data, 0, len(data) - len(self._begun)):
+        """Take the bytes of the keys pressed until now_s."""
+        for key in _KEY.findall(data):
             if key in ARROWS:
                 axis, side = ARROWS[key]
                 self._axes[axis] = side, now_s
             elif key in (b"+", b"=", b"-"):
                 self.share = self.share / 2 if key == b"-" else min(1.0, 2 * self.share)
-            elif key in b"aA":
+            elif key == b"a":  # not A, with which a key ends whose bytes come in parts
                 self.arm_asked = True
-            elif key in b"qQ\x04":
+            elif key in b"q\x04":
                 self.quit = True
             else:  # space, and any key that means nothing: in doubt the wheels stop
                 self.stop_asked |= key == b" "
-                self._release()
-        if begun:
-            self._release()  # It may be the key Esc, which means nothing.
+                self._axes = [(0, pressed_s) for _, pressed_s in self._axes]
 
     def twist(self, now_s: float) -> tuple[float, float]:
         """Return forward speed [m/s] and yaw rate [rad/s]."""
@@ -80,9 +73,6 @@ class Stick:
     def commands(self, now_s: float) -> bool:
         """Return True if there is a motion, or was one until a moment ago."""
         return any(now_s - pressed_s <= 2 * HOLD_S for _, pressed_s in self._axes)
-
-    def _release(self) -> None:
-        self._axes = [(0, pressed_s) for _, pressed_s in self._axes]
 
 
 def teleoperate(bus: BusConfig) -> int:

@@ -33,22 +33,18 @@ from omnid.core.control.safety_rules import AWAITED
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
-from omnid.diagnostics.run_summary import RunStatistics
-from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
-from omnid.engine.graph import Graph, Stream
+from omnid.diagnostics.status import RunStatistics, StatusCollector, image_stats, rig_stats, wheel_stats
+from omnid.engine.graph import Graph, Stream, Telemetry
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER, Report, log
 from omnid.engine.process import prepare, start_thread
 from omnid.engine.robot_clock import RobotClock, fixed_offset
-from omnid.engine.telemetry import Telemetry
 from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.plain_text import one_line
 from omnid.runs.files import RunPlaces
-from omnid.runs.session import Session, run_to_end
-from omnid.runs.wiring import RECORDED_DEPTH, Inputs, Outputs, wire
+from omnid.runs.wiring import RECORDED_DEPTH, Inputs, Outputs, Session, run_to_end, wire
 from omnid.settings import dump
-from omnid.sinks.bus_sink import BusSink, PanoramaSink
-from omnid.sinks.encoder import Encoder
+from omnid.sinks.encoder import BusSink, Encoder, PanoramaSink
 from omnid.sinks.recorder import Recorder
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.obstacles import FLOOR_WARNING, controller_scan
@@ -296,7 +292,7 @@ def open_recorder(
     folder = Path(config.record.folder)
     files = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
     images_hz = config.record.images_hz if encode is not None else 0.0
-    return Recorder(files, config.bus.robot, encode, clock=clock, skip_invalid=True, images_hz=images_hz)
+    return Recorder(files, config.bus.robot, encode, clock=clock, images_hz=images_hz)
 
 
 def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: Report) -> Recorder:
@@ -314,7 +310,7 @@ def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: st
     report(
         logging.INFO if written else logging.WARNING,
         f"recorded {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
-        f"refused {recorder.invalid}, oldest files deleted {state.deleted}, {state.status}",
+        f"oldest files deleted {state.deleted}, {state.status}",
     )
     return recorder
 

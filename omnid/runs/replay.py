@@ -24,11 +24,9 @@ from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
-from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings, pair_loss
-from omnid.diagnostics.status import stage_stats
-from omnid.engine.graph import Graph, Sink
+from omnid.diagnostics.status import RunCounters, RunStatistics, input_warnings, pair_loss, stage_stats
+from omnid.engine.graph import POLL_S, Graph, Sink, sleep_until
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.threads import POLL_S, sleep_until
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
@@ -36,12 +34,10 @@ from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.files import RunPlaces
-from omnid.runs.session import Session, attached_rig, run_to_end
-from omnid.runs.wiring import Inputs, Outputs, WiredStages, wire
+from omnid.runs.wiring import Inputs, Outputs, Session, WiredStages, attached_rig, run_to_end, wire
 from omnid.settings import dump
-from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
-from omnid.sinks.encoder import Outgoing
+from omnid.sinks.encoder import BusSink, Outgoing
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd

@@ -29,8 +29,7 @@ from omnid.engine.graph import Graph, Output, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.files import RunPlaces
-from omnid.runs.session import run_to_end
-from omnid.runs.wiring import Inputs, Outputs, wire
+from omnid.runs.wiring import Inputs, Outputs, run_to_end, wire
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER, controller_pose

@@ -24,10 +24,8 @@ from omnid.controller.link import ControllerStatistics, DriveLink
 from omnid.core.control.arming import NO_CONTACT, ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
-from omnid.engine.graph import Stream, nothing
-from omnid.engine.telemetry import StageStats
-from omnid.engine.threads import sleep_until
-from omnid.runs.session import Session
+from omnid.engine.graph import StageStats, Stream, nothing, sleep_until
+from omnid.runs.wiring import Session
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.stages.synchronise import MotionInbox

@@ -79,18 +79,14 @@ class ReplayDrive:
             self._link.send(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
             self._link.send(TimedSetpoint(now_ns, self._setpoint))
             self._link.receive_waiting()
-            self._require_motor()
+            if self._link.statistics.state.failed:
+                raise DriverError(NO_MOTOR)
 
     def finish(self) -> None:
-        """Have the wheels slow down to a stop, take the last reports; DriverError where the motor controller failed."""
+        """Have the wheels slow down to a stop, and take the last reports."""
         self._link.end()
         for _ in self._link.commands():
             pass
-        self._require_motor()
-
-    def _require_motor(self) -> None:
-        if self._link.statistics.state.failed:
-            raise DriverError(NO_MOTOR)
 
     def counts(self) -> dict[str, int]:
         """Return the commands that were answered, the errors, and how often moving wheels had to stop."""

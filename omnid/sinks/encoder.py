@@ -1,25 +1,31 @@
-"""Encoding of poses, commands and maps as ROS 2 messages (topic, schema, CDR bytes), for the bus and for logs."""
+"""Poses, commands and maps as ROS 2 messages (topic, schema, CDR bytes) for the bus and for logs; what is published."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from calib.rig import Rig
+from drivers.frame import Frame
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.frames import base_pose, in_outer_axes, of_base
+from omnid.core.mapping.voxel_map import ThinnedPath
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
-from omnid.transport.codec import Diagnostics, DiagnosticStatus, PoseAttachment
-from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
-from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry
-from omnid.transport.topics import MAP_POSE, PUBLISHED, SCAN
+from omnid.transport.bus import Bus
+from omnid.transport.codec import CLOCK_SCHEMA, Diagnostics, DiagnosticStatus, PoseAttachment, encoded, path_cdr
+from omnid.transport.sensor_codec import gyro_cdr, image_cdr, wheel_cdr
+from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, RUN_ID, Key, Stats, entry
+from omnid.transport.topics import CLOCK, MAP_POSE, PANORAMA, PUBLISHED, SCAN
 
 Outgoing: TypeAlias = (
     OdometryUpdate
@@ -36,6 +42,9 @@ Outgoing: TypeAlias = (
 UnixTime: TypeAlias = Callable[[int], int]  # returns the Unix time of a stamp [ns]
 # Topic, ROS type and bytes of an encoded message; a topic without a leading '/' is below the robot's name.
 OutgoingMessage: TypeAlias = tuple[str, str, bytes]
+
+# Of the path that is published: most vertices, the least distance between two of them, and the time between two paths.
+PATH_POSES, PATH_STEP_M, PATH_NS = 500, 0.05, 5 * NS_PER_S
 
 
 def _on(topic: str, payload: bytes) -> OutgoingMessage:
@@ -171,3 +180,51 @@ def navigation_stats(update: NavigationUpdate) -> Stats:
     if update.answer is not None:
         stats |= {"request": update.answer.request, "refusal": update.answer.refusal}
     return stats
+
+
+class BusSink:
+    """Publishes encoded messages; live, its inbox drops the oldest, because the bus may be slow."""
+
+    def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
+        """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
+        self._clock, self._time_ns = clock, 0
+        self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
+        self._bus, self._encode, encode.run_id = bus, encode, RUN_ID
+
+    def process(self, message: Outgoing) -> None:
+        """Publish a message; a pose with its attachment."""
+        # 1. The clock, before what is stamped by it.
+        if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
+            self._time_ns = message.stamp_ns
+            self._bus.publish(CLOCK, encoded(CLOCK_SCHEMA, self._encode.unix_ns(message.stamp_ns)))
+        # 2. The message itself.
+        attachment = pose_attachment(message, time.time_ns(), RUN_ID) if isinstance(message, OdometryUpdate) else None
+        for topic, _, payload in self._encode(message):
+            self._bus.publish(topic, payload, attachment if topic == "odom" else None)
+        # 3. The path of the base, from time to time, for those who come after a drive.
+        if isinstance(message, OdometryUpdate):
+            T_base_rig = self._encode.T_base_rig
+            T_odom_base = T_base_rig @ message.T_odom_rig @ se3.inverse(T_base_rig)
+            self._path.add(*T_odom_base[:2, -1].tolist())
+            if message.stamp_ns >= self._path_ns + PATH_NS:
+                self._path_ns = message.stamp_ns
+                path = path_cdr(self._encode.unix_ns(message.stamp_ns), "odom", self._path.xy())
+                self._bus.publish("path", path)
+
+
+class PanoramaSink:
+    """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second, while it has a subscriber."""
+
+    def __init__(self, bus: Bus, rate_hz: float, unix_ns: UnixTime = int) -> None:
+        """unix_ns: the Encoder's."""
+        self._bus, self._period_ns, self._unix_ns = bus, NS_PER_S / rate_hz, unix_ns
+        self._next_ns = 0.0
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Publish the panorama of a pose when it is due."""
+        if odometry.stamp_ns < self._next_ns or not self._bus.is_received(PANORAMA):
+            return
+        self._next_ns = odometry.stamp_ns + self._period_ns
+        _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
+        frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
+        self._bus.publish(PANORAMA, image_cdr(frame, self._unix_ns(odometry.stamp_ns))[1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -31,34 +30,23 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
 
     Leaves no file behind. Raises OmnidError.
     """
-    used = {_identity(path): what for what, path in inputs}
+    used = {path.resolve(): what for what, path in inputs}
     for option, path in outputs:
         wrong = ""
-        try:
-            if path.is_dir():
-                wrong = "expected a file to write, found a folder"
-            elif not path.parent.is_dir():
-                wrong = f"there is no folder {path.parent}"
-            elif path.exists() and not path.is_file():  # not opened: a pipe that is opened would end its reader
-                wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
-            elif (other := used.setdefault(_identity(path), option)) != option:
-                wrong = f"this is {other} as well"
-            elif is_locked(path):
-                wrong = "another program is writing it"
-            elif not os.access(path if path.exists() else path.parent, os.W_OK):
-                wrong = "it may not be written"
-        except OSError as error:
-            wrong = error.strerror or str(error)
+        if path.is_dir():
+            wrong = "expected a file to write, found a folder"
+        elif not path.parent.is_dir():
+            wrong = f"there is no folder {path.parent}"
+        elif path.exists() and not path.is_file():  # not opened: a pipe that is opened would end its reader
+            wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
+        elif (other := used.setdefault(path.resolve(), option)) != option:
+            wrong = f"this is {other} as well"
+        elif is_locked(path):
+            wrong = "another program is writing it"
+        elif not os.access(path if path.exists() else path.parent, os.W_OK):
+            wrong = "it may not be written"
         if wrong:
             raise OmnidError(f"{option} {path}: {wrong}; name another file")
-
-
-def _identity(path: Path) -> tuple[int, int] | str:
-    """Return a key that is the same for all names of a file, hard and symbolic links included."""
-    with suppress(OSError):
-        found = path.stat()
-        return found.st_dev, found.st_ino
-    return os.path.realpath(path)
 
 
 class TrajectoryFile:

@@ -12,7 +12,6 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotatingLogState
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.engine.robot_clock import RobotClock, log_time
-from omnid.errors import OmnidError
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.topics import ros_name
@@ -77,9 +76,8 @@ class ThinnedPairs:
 class Recorder:
     """A sink that writes every message under `/<robot>/`.
 
-    A live run gives it an inbox that drops, so that no stage waits for the disk, a RotatingLog, which
-    never raises, and skip_invalid=True; then `invalid` counts what could not be encoded. A replay loses nothing: a
-    message that cannot be encoded or written raises OmnidError or DriverError.
+    A live run gives it an inbox that drops, so that no stage waits for the disk, and a RotatingLog, which never raises.
+    A replay loses nothing: a message that cannot be written raises DriverError.
 
     Without an encoder only frames are recorded. Who runs the graph closes the recorder, after what is added at the end.
     newest_ns: latest stamp of the messages.
@@ -92,7 +90,6 @@ class Recorder:
         encode: Encoder | None = None,
         *,
         clock: RobotClock | None = None,
-        skip_invalid: bool = False,
         images_hz: float = 0.0,
     ) -> None:
         """clock: that of the stamps, None: they are Unix time; the encoder has its segment_unix_ns.
@@ -100,12 +97,11 @@ class Recorder:
         images_hz: pairs of images a second that are recorded; 0: all.
         """
         self._log, self._robot, self._encode = log, robot, encode
-        self._clock, self._skip_invalid = clock or log_time(), skip_invalid
+        self._clock = clock or log_time()
         self._steps = self._clock.steps
         self._thinned = ThinnedPairs(images_hz)
         self._files = 0
         self.newest_ns = 0
-        self.invalid = 0
 
     @property
     def state(self) -> RotatingLogState:
@@ -114,9 +110,8 @@ class Recorder:
 
     def stats(self) -> dict[str, object]:
         """Return the state of the files, with counts of all that was lost after the inbox."""
-        state, names = self.state, ("messages", "lost", "files", "deleted")
-        counts = {name: getattr(state, name) for name in names} | {"invalid": self.invalid}
-        return {**counts, "state": state.status, "problem": state.problem}
+        state, names = self.state, ("messages", "lost", "files", "deleted", "problem")
+        return {name: getattr(state, name) for name in names} | {"state": state.status}
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""
@@ -131,18 +126,13 @@ class Recorder:
             encode.repeat_states()
         self._files = self.state.files
         # 3. The message.
-        try:
-            if isinstance(message, Frame):
-                for frame in self._thinned.take(message):
-                    frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
-                    self._write([(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
-            elif encode is not None:
-                self._write(encode(message), stamp_ns)
-            self.newest_ns = max(self.newest_ns, stamp_ns)
-        except OmnidError:  # for example a stamp that is not a time
-            if not self._skip_invalid:
-                raise
-            self.invalid += 1
+        if isinstance(message, Frame):
+            for frame in self._thinned.take(message):
+                frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
+                self._write([(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
+        elif encode is not None:
+            self._write(encode(message), stamp_ns)
+        self.newest_ns = max(self.newest_ns, stamp_ns)
 
     def close(self) -> None:
         """Complete the last file; a second call does nothing."""

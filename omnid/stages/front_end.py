@@ -24,9 +24,7 @@ from omnid.core.places.recognition import Relocaliser
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.types.panorama import Panoramas
 from omnid.messages import FramePair, OdometryUpdate, StereoDepth
-from omnid.stages.dense_depths import DenseDepths
-from omnid.stages.dewarp import Dewarp
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import DenseDepths, Dewarp, Geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 

@@ -1,26 +1,49 @@
-"""Geometry of a run: the rig with its masks, the cylinder of the panoramas, and the rectified frame."""
+"""Geometry of a run, and what is made of its pairs: panoramas (Dang et al. 2012, section III.A), and dense depth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
+from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.panorama import Cylinder, fit_cylinder
+from calib.panorama import Cylinder, Maps, fit_cylinder, remap_tables, visible
 from calib.rig import MountedCamera, Rig
 from calib.rim import find_rim
 from drivers.frame import Camera, Frame
-from omnid.config import PanoramaConfig
+from drivers.jpeg import Steps
+from omnid.config import PanoramaConfig, StereoConfig
+from omnid.core.nanoseconds import NS_PER_S
+from omnid.core.odometry.earlier_view import EarlierView, contradicted
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.line_times import RawImage
+from omnid.core.stereo.matcher import Matcher
+from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
+from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
+from omnid.core.stereo.triangulation import triangulate
+from omnid.core.types.panorama import PaddedPanorama, Panoramas
+from omnid.core.types.pixel_times import PixelTimes
 from omnid.core.types.stereo_model import StereoModel
+from omnid.engine.graph import Lock
+from omnid.errors import OmnidError
+from omnid.messages import DensePoints, FramePair, StereoDepth
 from omnid.stages.synchronise import Decoder
 
 Array = NDArray[np.float64]
 
 FRAMES = 12  # of both cameras, in the maximum of which the rims are looked for
+
+NOISE_NS = NS_PER_S  # Time between two measurements of the noise, because exposure changes it slowly.
+BLUR_SHARE = 0.6  # sigma of the blur by the additional pixels that a pixel of the panorama covers
+DISPARITY_STEP_PX = 32  # the semi-global prior searches a multiple of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,3 +84,182 @@ def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
         rim = find_rim(brightest[name], mounted[name].camera.center) if name in brightest else None
         mounted[name] = replace(mounted[name], mask=rim)
     return replace(rig, lower=mounted["lower"], upper=mounted["upper"]) if brightest else rig
+
+
+class Dewarp:
+    """Rectifies both images of a pair."""
+
+    def __init__(self, geometry: Geometry, config: PanoramaConfig) -> None:
+        self._noise_grey: dict[Side, float] = {}  # noise of each camera before its gain
+        self._measured_ns: int | None = None  # stamp of the pair in which the noise was measured last
+        self._pad_px, self._inner = config.pad_px, np.s_[:, config.pad_px : -config.pad_px]
+        rig, self._cylinder = geometry.rig, geometry.cylinder
+        self._lower, self._upper = tables = [
+            remap_tables(rig, one, self._cylinder, config.pad_px) for one in (rig.lower, rig.upper)
+        ]
+        self._blur_px = _blur_px(tables)
+        both = visible(rig.lower, self._lower, config.rim_margin_px)
+        both &= visible(rig.upper, self._upper, config.rim_margin_px)
+        self._visible = np.ascontiguousarray(_inner(both, config.margin_px)[self._inner])
+        if not self._visible.any():
+            raise OmnidError("the cameras share no part of the panorama: check the rig's transforms and masks")
+        self._tiles = TileMonitor(self._visible, tile_columns(self._cylinder))
+        self._upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
+        (lower_u, lower_v), (upper_u, upper_v) = ([table[self._inner] for table in maps] for maps in tables)
+        self.raw_images = (
+            RawImage(lower_u, lower_v, rig.lower.camera.size),
+            RawImage(upper_u, upper_v, rig.upper.camera.size),
+        )
+        self._rows_s = [rows * np.float32(line_s) for rows in (lower_v, upper_v)] if line_s else []
+
+    def process(self, pair: FramePair) -> Panoramas:
+        """Return the panoramas of a pair."""
+        # 1. Rectify both images, with the padding and without; the noise is measured in some of the pairs.
+        raw: dict[Side, tuple[NDArray[np.uint8], Maps, Steps]] = {
+            "lower": (pair.lower, self._lower, pair.jpeg_steps[0]),
+            "upper": (pair.upper, self._upper, pair.jpeg_steps[1]),
+        }
+        padded, grey = dict[Side, NDArray[np.uint8]](), dict[Side, NDArray[np.uint8]]()
+        for side, (image, maps, _) in raw.items():
+            smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
+            padded[side] = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
+            grey[side] = np.ascontiguousarray(padded[side][self._inner])
+        if self._measured_ns is None or abs(pair.stamp_ns - self._measured_ns) >= NOISE_NS:
+            self._measured_ns = pair.stamp_ns
+            self._noise_grey = {side: noise_sigma(grey[side], self._visible) for side in SIDES}
+        # 2. The light of each, and of the camera that shows less contrast, which decides how much there is.
+        sums = {side: self._tiles.sums(side, grey[side]) for side in SIDES}
+        lights = [light(sums[side], self._noise_grey[side]) for side in SIDES]
+        dimmer = min(lights, key=lambda light: light.contrast_to_noise)
+        # 3. Gains for dim images.
+        by_level = gain_of(lights[0].level_grey), gain_of(lights[1].level_grey)
+        gains = dict(zip(SIDES, pair_gains(sums["lower"], sums["upper"], by_level), strict=True))
+        cylinder = self._cylinder
+        lower, upper = (
+            PaddedPanorama(
+                brightened(padded[side], gains[side]),
+                self._pad_px,
+                gains[side] * self._noise_grey[side],
+                gains[side],
+                cylinder.turn_px,
+                cylinder.first,
+                raw[side][2],
+                cylinder.scale,
+            )
+            for side in SIDES
+        )
+        # 4. Times of exposure of the pixels, and parts of the images that are dead or blind.
+        times = PixelTimes(pair.skew_s + self._upper_delay_s, *self._rows_s)
+        tiles = self._tiles.update(grey, sums, self._noise_grey)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
+
+
+def _blur_px(tables: Sequence[Maps]) -> float:
+    """Return the sigma [px] of the blur of the images, so that a coarser panorama has no aliasing; 0: none.
+
+    A pixel of a panorama that covers n pixels of the image has the blur that makes one of n.
+    """
+    steps = [np.hypot(np.diff(u, axis=1), np.diff(v, axis=1))[(u[:, 1:] >= 0) & (u[:, :-1] >= 0)] for u, v in tables]
+    covered_px = float(np.median(np.concatenate(steps)))
+    return BLUR_SHARE * math.sqrt(covered_px**2 - 1) if covered_px > 1 else 0.0
+
+
+def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
+    """Return the region (H, W) without a margin along its border and along the first and last rows."""
+    side = 2 * margin_px + 1
+    inner = cv2.erode(region.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=1) > 0
+    inner[: margin_px + 1], inner[len(inner) - margin_px - 1 :] = False, False
+    return inner
+
+
+class DenseDepths:
+    """Dense depths, computed when they are first asked for.
+
+    Matching costs as much as the odometry of a pair, and few pairs need it: keyframes, and those that enter the map or
+    the obstacle scan. What was computed is remembered as long as the panoramas of the pair exist. Any thread may ask;
+    while one computes, others that ask for the same pair wait for the result.
+    """
+
+    def __init__(self, geometry: Geometry, config: StereoConfig) -> None:
+        self._config, self._cylinder, self._baseline_m = config, geometry.cylinder, geometry.rig.baseline_m
+        self._T_rig_rect = geometry.T_rig_rect
+        # Disparities up to those of the nearest points; rows are left beyond the largest one.
+        height, step_px = geometry.cylinder.height, DISPARITY_STEP_PX
+        limit = (height - step_px // 2) // step_px * step_px
+        if limit < step_px:
+            raise OmnidError(
+                f"the panoramas are {height} px high, stereo needs at least {step_px + step_px // 2} px: use "
+                "larger images, or a rig whose cameras share more of their view"
+            )
+        nearest_px = self._cylinder.focal_px * self._baseline_m / config.min_range_m
+        disparities = min(config.matching.disparities, math.ceil(nearest_px / step_px) * step_px, limit)
+        self._matching = replace(config.matching, disparities=disparities)
+        self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
+        self._known: WeakKeyDictionary[Panoramas, tuple[dict[object, DensePoints], Lock]] = WeakKeyDictionary()
+        self._one = Lock()
+
+    def of(self, depth: StereoDepth) -> DensePoints:
+        """Return the dense depth of a pair whose pose is known: points that its earlier view does not contradict."""
+        dense, earlier = self.points(depth.panoramas, depth.exposure), depth.earlier
+        if earlier is None:
+            return dense
+        compute = partial(self._confirmed, depth.panoramas.lower, dense, earlier)
+        return self._once(depth.panoramas, (depth.exposure, earlier), compute)
+
+    def points(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
+        """Return disparities and their points in the rig frame, as matched, at the stamp of the pair.
+
+        exposure: the motion during the exposures; None: unknown, or none is needed.
+        """
+        return self._once(panoramas, exposure, partial(self._computed, panoramas, exposure))
+
+    def _once(self, panoramas: Panoramas, key: object, compute: Callable[[], DensePoints]) -> DensePoints:
+        """Return what was computed of a pair, by what it depends on; others wait meanwhile."""
+        with self._one:
+            known, one = self._known.setdefault(panoramas, ({}, Lock()))
+        with one:
+            if key not in known:
+                known[key] = compute()
+            return known[key]
+
+    def _computed(self, panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
+        """Return the depth of panoramas, corrected for a motion during their exposures."""
+        # 1. Match the pixels of the lower panorama along their columns.
+        lower, pad = panoramas.lower, panoramas.lower.pad_px
+        valid = np.pad(panoramas.usable, ((0, 0), (pad, pad)))
+        shift = None if exposure is None else exposure.column_shift(panoramas.visible.shape, pad)
+        try:
+            matcher = self._idle.pop()
+        except IndexError:
+            matcher = Matcher(lower.image.shape[:2], self._matching)
+        flat, found = matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey, shift)
+        self._idle.append(matcher)
+        rows, columns = np.divmod(flat, lower.image.shape[1])
+        columns -= pad
+        # 2. Correct rows and disparities to the stamp of the pair.
+        views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
+        if exposure is not None:
+            views, of_motion = exposure.corrected(views[:, :2], views[:, 2])
+            noise = of_motion.noise(exposure.motion)
+            by_motion = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
+        disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
+        disparity[rows, columns] = views[:, 2] - views[:, 1]
+        # 3. Triangulate, with the variance along the ray: the distance from the axis is r = f t / d, so sigma_r is
+        #    r^2 / (f t) sigma_d, and sqrt(1 + z^2 / r^2) times as large along the ray.
+        points = triangulate(views, self._cylinder, self._baseline_m)
+        kept = np.isfinite(points).all(axis=1)
+        points = points[kept]
+        r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
+        per_px = r2 / (self._cylinder.focal_px * self._baseline_m)
+        variance_m2 = (1 + z2 / r2) * per_px**2 * (self._config.noise_px**2 + by_motion[kept])
+        pixels = np.column_stack([columns, rows])[kept].astype(float)
+        return DensePoints(disparity, pixels, se3.apply(self._T_rig_rect, points), variance_m2)
+
+    def _confirmed(self, lower: PaddedPanorama, dense: DensePoints, earlier: EarlierView) -> DensePoints:
+        """Return the dense points of a pair without those that its earlier view contradicts."""
+        points = se3.apply(se3.inverse(self._T_rig_rect), dense.points)
+        wrong = contradicted(lower, dense.pixels, points, self._cylinder, earlier)
+        disparity = dense.disparity.copy()
+        columns, rows = dense.pixels[wrong].astype(np.intp).T
+        disparity[rows, columns] = np.nan
+        return DensePoints(disparity, dense.pixels[~wrong], dense.points[~wrong], dense.variance_m2[~wrong])

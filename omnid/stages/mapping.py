@@ -13,7 +13,7 @@ from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.core.mapping.voxel_map import ThinnedPath, VoxelMap
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
-from omnid.stages.dense_depths import DenseDepths
+from omnid.stages.geometry import DenseDepths
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]

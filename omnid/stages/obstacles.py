@@ -24,8 +24,7 @@ from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.ray_scans import RayScans
 from omnid.core.stereo.tiles import tile_columns
 from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
-from omnid.stages.dense_depths import DenseDepths
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import DenseDepths, Geometry
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]

@@ -16,8 +16,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.messages import DensePoints, MapKeyframes, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.stages.dense_depths import DenseDepths
-from omnid.stages.geometry import Geometry
+from omnid.stages.geometry import DenseDepths, Geometry
 from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.tracking_state import MapState, TrackingState
 

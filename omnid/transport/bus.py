@@ -23,7 +23,7 @@ from typing import Any, Final
 import zenoh
 from zenoh import ext
 
-from omnid.engine.threads import Poller
+from omnid.engine.graph import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.session import ALIVE, PERIOD_S, BusConfig, has_receiver, open_session, reason

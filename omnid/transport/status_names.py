@@ -18,7 +18,7 @@ from typing import Any, Final, TypeAlias
 import msgspec
 
 from omnid.core.control.safety_rules import ASKED
-from omnid.engine.telemetry import Histogram
+from omnid.engine.graph import Histogram
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState

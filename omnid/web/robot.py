@@ -26,7 +26,7 @@ from omnid.client import ANSWER_S, Answer, Driver, Robot
 from omnid.core.control.heading_controller import VelocityLimits
 from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, navigation_verb, route_request
 from omnid.errors import OmnidError
-from omnid.monitor.navigation import stop
+from omnid.monitor.robot_state import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.web.feed import OLDEST_S, RobotFeed, is_recent, server_ms
 

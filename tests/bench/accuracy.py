@@ -21,7 +21,7 @@ from calib import se3
 from calib.importers import parse_chain
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
-from omnid.diagnostics.run_summary import summary_entries
+from omnid.diagnostics.status import summary_entries
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from tests.bench.paper.measures import surface_distance_m

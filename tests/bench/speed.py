@@ -29,9 +29,8 @@ from omnid.messages import OdometryUpdate
 from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.sinks.files import TrajectoryFile
-from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.geometry import Dewarp, geometry, with_rims
 from omnid.stages.mapping import Mapping
 from omnid.stages.synchronise import Synchronise
 from tests.bench.accuracy import rig_of

@@ -21,7 +21,7 @@ from calib.rig_file import rig_toml
 from drivers.cameras.log_camera import LogPlayback
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
-from omnid.runs.session import attached_rig
+from omnid.runs.wiring import attached_rig
 from omnid.stages.geometry import with_rims
 from tests.contract.simulated_controllers import LONGEST_ABSENCE_S, SimulatedLine
 from tests.hardware.image import ROOT, ImageUnavailableError, image

@@ -23,7 +23,7 @@ from calib.rig_file import parse_rig, read_rig, rig_toml, write_rig
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.diagnostics.run_summary import RunStatistics
+from omnid.diagnostics.status import RunStatistics
 from omnid.engine.graph import Graph, nothing
 from omnid.formats.exports import write_ply
 from omnid.formats.tum import read_tum

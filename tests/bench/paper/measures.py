@@ -24,7 +24,7 @@ from omnid.core.types.panorama import Panoramas
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.stages.dense_depths import DenseDepths
+from omnid.stages.geometry import DenseDepths
 from tests.bench.paper.scenes import TURNS_DEG, WALL_M, Experiment, Views
 from tests.bench.results import Cell
 from tests.simulation.recipes import SimulatedRun

@@ -19,8 +19,7 @@ from omnid.config import Config
 from omnid.core.types.panorama import Panoramas
 from omnid.simulation.rendering.surfaces import CEILING_M, PAINTERS, Rectangle, Scene
 from omnid.simulation.world import load_world
-from omnid.stages.dewarp import Dewarp
-from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.geometry import Dewarp, Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from tests.bench.drive import lap
 from tests.simulation import paths

@@ -15,7 +15,7 @@ from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.motion_monitor import AGREE, Conflict, TrustSettings
 from omnid.core.control.safety_rules import Deadlines
-from omnid.engine.telemetry import StageStats
+from omnid.engine.graph import StageStats
 
 PERIOD_S = 0.05
 PERIOD_NS = 50_000_000

@@ -33,8 +33,8 @@ from omnid.core.control.collision_monitor import BLOCKED, SCAN_STALE, CollisionS
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.safety_rules import BUMPER, CLIFF, Deadlines
+from omnid.engine.graph import StageStats
 from omnid.engine.process import RealtimeSettings
-from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 from tests.contract.simulated_controllers import PtyMotor
 from tests.omnid.controller.bench import PERIOD_S, UNATTENDED, Wheels

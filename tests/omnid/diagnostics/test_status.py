@@ -22,10 +22,9 @@ from omnid.core.control.arming import ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
-from omnid.diagnostics.run_summary import RunStatistics
-from omnid.diagnostics.status import StatusCollector, image_stats, wheel_stats
+from omnid.diagnostics.status import RunStatistics, StatusCollector, image_stats, wheel_stats
+from omnid.engine.graph import StageStats, Telemetry
 from omnid.engine.robot_clock import RobotClock
-from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.sinks.drive import controller_pose
 from omnid.stages.synchronise import Synchronise

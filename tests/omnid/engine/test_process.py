@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from omnid.engine.graph import Poller
 from omnid.engine.process import python, python_environment
 from omnid.engine.robot_clock import RobotClock
-from omnid.engine.threads import Poller
 from tests.set_clock import SetClock
 
 ROOT = Path(__file__).parents[3]

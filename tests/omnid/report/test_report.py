@@ -27,7 +27,7 @@ from omnid.recordings.evaluation import evaluate
 from omnid.report.page import style_and_script
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
-from omnid.runs.session import attached_rig
+from omnid.runs.wiring import attached_rig
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, WHEELS, Key, stage_name

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.telemetry import StageStats, Telemetry
+from omnid.diagnostics.status import RunStatistics
+from omnid.engine.graph import StageStats, Telemetry
 from omnid.runs.live import Service, period_s
 
 

@@ -25,12 +25,11 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.types.panorama import PaddedPanorama
-from omnid.engine.telemetry import StageStats
+from omnid.engine.graph import StageStats
 from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import ReplayDrive, navigation_answers, planner_setpoint
-from omnid.sinks.encoder import Encoder, Outgoing
+from omnid.sinks.encoder import BusSink, Encoder, Outgoing, PanoramaSink
 from omnid.tracking_state import TrackingState
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PlanarPath, decode_pose

@@ -19,15 +19,14 @@ from calib.rig_file import read_rig
 from drivers.frame import CAMERAS, Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.diagnostics.run_summary import RunStatistics
+from omnid.diagnostics.status import RunStatistics
 from omnid.engine.graph import Graph, nothing
 from omnid.formats.tum import read_tum
 from omnid.messages import FramePair, OdometryUpdate
 from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import Inputs, Outputs, wire
-from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.geometry import Dewarp, Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
 from tests.simulation import build, render_grey

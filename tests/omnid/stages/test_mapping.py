@@ -14,8 +14,7 @@ from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.types.panorama import Panoramas
 from omnid.messages import DensePoints, OdometryUpdate, PlaceUpdate, StereoDepth
-from omnid.stages.dense_depths import DenseDepths
-from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.geometry import DenseDepths, Geometry, geometry
 from omnid.stages.mapping import MapGrid, Mapping
 from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.scenery import wrapped

@@ -19,9 +19,8 @@ from omnid.core.rig.rig_health import VIEWS, RigContradictedError, RigHealth, Ri
 from omnid.core.types.panorama import Panoramas
 from omnid.diagnostics.status import rig_stats
 from omnid.engine.graph import Graph
-from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.geometry import Dewarp, Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import RIG, entry
