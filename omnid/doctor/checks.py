@@ -64,9 +64,6 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
             yield Finding("error", subject, device.problem, "change section [cameras] of the configuration")
         else:
             yield Finding("ok", subject, f"{device.name} at {device.node}")
-    if len({path.resolve() for path in names.values()}) < len(names):
-        advice = "configure one for each, see `omnid cameras`"
-        yield Finding("error", "cameras", "both names lead to one device", advice)
 
 
 def motor(settings: MotorSettings, root: Path = Path("/")) -> Iterator[Finding]:
@@ -105,16 +102,16 @@ def access(subject: str, device: Path) -> Finding | None:
 
 def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
     """Check that this user may have the real-time priority, and may lock memory."""
-    highest, locks = highest_priority(), may_lock()
+    highest, locks = highest_priority(), may_lock() or not lock_memory
+    allowed = f"priorities up to {highest} are allowed"
     if priority > highest:
-        refused = f"priority {priority} is not allowed, this user may have {highest}; the unit sets LimitRTPRIO"
-        yield Finding("warning", "real time", refused, PRIORITY_ADVICE)
+        yield Finding("warning", "real time", allowed, PRIORITY_ADVICE)
     else:
-        yield Finding("ok", "real time", f"priorities up to {highest} are allowed")
-    if lock_memory and not locks:
+        yield Finding("ok", "real time", allowed)
+    if locks:
+        yield Finding("ok", "memory", "may be locked, or need not be")
+    else:
         yield Finding("warning", "memory", "this user may not lock memory; the unit sets LimitMEMLOCK", LOCK_ADVICE)
-    else:
-        yield Finding("ok", "memory", "may be locked" if locks else "not locked: realtime.lock_memory = false")
 
 
 def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Finding]:
@@ -128,12 +125,8 @@ def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Fin
         level: Level = "error" if config.enabled else "warning"
         yield Finding(level, "disk", full, "delete files, or change record.folder")
     else:
-        hours = usable / bytes_per_s / 3600
-        kept = (
-            f"{where}: the newest {usable / 1e9:.1f} GB of recordings are kept, some {hours:.1f} h "
-            f"of JPEG at {bytes_per_s / 1e6:.1f} MB/s (record.keep_mb, record.images_hz)"
-        )
-        yield Finding("ok", "disk", kept)
+        hours = f"some {usable / bytes_per_s / 3600:.1f} h of JPEG (record.keep_mb, record.images_hz)"
+        yield Finding("ok", "disk", f"{where}: the newest {usable / 1e9:.1f} GB of recordings are kept, {hours}")
     if not folder.is_relative_to(STATE):
         elsewhere = f"the service may write in {STATE} only, record.folder is {folder}"
         yield Finding("warning", "disk", elsewhere, f"`systemctl edit omnid`: [Service], ReadWritePaths={folder}")

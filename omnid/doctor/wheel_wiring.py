@@ -14,13 +14,11 @@ from typing import Final
 
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import NoReplyError
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.motor import MotorSettings, open_motor
 from omnid.errors import OmnidError
 
 MOVE_S, REST_S = 1.0, 0.3  # duration of a motion in each direction, and of the rest after it
-ANSWER_S: Final = MOVE_S  # A stop is repeated for this time: a busy computer delays answers by parts of it.
 
 BEFORE: Final = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair
 away from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to
@@ -59,8 +57,10 @@ def tested_drive(
             turn = -1.0 if channel == 1 else 1.0  # the command of the other wheel becomes 0
             for sign in (1, -1):
                 velocity_mps, yaw_rate_radps = sign * speed_mps / 2, sign * turn * speed_mps / drive.track_m
-                _move(motor, config, velocity_mps, yaw_rate_radps)
-                time.sleep(REST_S)
+                # After a pause the driver sends a stop in place of the first command.
+                _send(motor, stop_command(0), 0.0, config.rate_hz)
+                _send(motor, VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps), MOVE_S, config.rate_hz)
+                _send(motor, stop_command(0), REST_S, config.rate_hz)
 
         turned_deg = math.degrees(speed_mps * MOVE_S / drive.wheel_radius_m)
         seen = [_seen(channel, turned_deg, motion, ask) for channel in (1, 2)]
@@ -80,21 +80,16 @@ def _seen(
     """
     question = (
         f"Motor {channel} turned its wheel by {turned_deg:.0f} deg and back, or motor.drive.gear is wrong. Name the "
-        "wheel that moved (l left, r right, b both, n none, "
+        "wheel that moved (l left, r right, n none or both, a again): "
     )
     side = None
     while side is None:
         motion(channel)
-        letter = ask(f"{question}a again): ")[:1].lower()
+        letter = ask(question)[:1].lower()
         if letter == "n":
             raise OmnidError(
-                f"motor {channel} did not move: check power, cable, emergency stop and motor.protocol, or try a higher "
-                "--speed"
-            )
-        if letter == "b":
-            raise OmnidError(
-                f"motor {channel} moved both wheels: are they coupled, or do both controllers have one address "
-                "(motor.drive.can_id)?"
+                f"motor {channel} did not move one wheel: check power, cable, emergency stop, motor.protocol and "
+                "motor.drive.can_id, try a higher --speed"
             )
         side = {"l": "left", "r": "right"}.get(letter)
     answer = ""
@@ -103,30 +98,15 @@ def _seen(
     return side, answer == "y"
 
 
-def _move(motor: MotorDriver, config: MotorSettings, velocity_mps: float, yaw_rate_radps: float) -> None:
-    """Drive for MOVE_S, then stop."""
-    _stop(motor)  # after a pause the driver sends one in place of the first command
-    next_s = time.monotonic()
-    end_s = next_s + MOVE_S
-    while time.monotonic() < end_s:
-        # Without an answer the wheels keep turning, because the controller's watchdog expires much later.
-        with suppress(LateReplyError):
-            motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
-        next_s += 1 / config.rate_hz
-        time.sleep(max(0.0, min(next_s, end_s) - time.monotonic()))
-    _stop(motor)
+def _send(motor: MotorDriver, command: VelocityCommand, seconds: float, rate_hz: float) -> None:
+    """Send a command until a time has passed, at least once; DriverError where the controller does not answer.
 
-
-def _stop(motor: MotorDriver) -> None:
-    """Stop the wheels; DriverError where the controller gives no answer within ANSWER_S.
-
-    A late one is the fault of a busy computer: the stop is sent again.
+    An answer that comes late is the fault of a busy computer: the command is sent again.
     """
-    deadline_s = time.monotonic() + ANSWER_S
+    end_s = time.monotonic() + seconds
     while True:
-        try:
-            motor.send(stop_command(0))
+        with suppress(LateReplyError):
+            motor.send(command)
+        time.sleep(max(0.0, min(1 / rate_hz, end_s - time.monotonic())))
+        if time.monotonic() >= end_s:
             return
-        except NoReplyError:
-            if time.monotonic() >= deadline_s:
-                raise

@@ -33,10 +33,9 @@ from omnid.sinks.drive import LiveDrive, navigation_answers, planner_setpoint
 from omnid.sinks.encoder import Encoder, Outgoing, UnixTime
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry, with_rims
-from omnid.stages.mapping import MapGrid, Mapping
+from omnid.stages.mapping import MapGrid, Mapping, Places
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import Obstacles
-from omnid.stages.places import Places
 from omnid.transport import status_names
 from omnid.transport.bus import Bus
 from omnid.transport.codec import Diagnostics

@@ -21,8 +21,8 @@ from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate, StereoDept
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
+from omnid.stages.mapping import keyframe_ranges
 from omnid.stages.obstacles import UNWATCHED_M, CameraFloor, Obstacles, sectors_of
-from omnid.stages.places import keyframe_ranges
 from omnid.tracking_state import TrackingState
 from tests.omnid.core import test_floor
 from tests.omnid.core.obstacles.drawn_floor import (
