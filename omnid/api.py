@@ -145,17 +145,15 @@ class Odometry:
                     f"found {upper_stamp_ns}: give both in nanoseconds of one clock"
                 )
             # 2. Pair them; an image that repeats an earlier one gives no pair.
-            pairing, before = self._front_end.pairing, self._front_end.pairing.counts
             _, pair = [
-                pairing.process(Frame(self._seq, at_ns, name, "mono8", image, image.shape[1], image.shape[0]))
+                self._front_end.pairing.process(Frame(self._seq, at_ns, name, "mono8", image, *image.shape[::-1]))
                 for name, at_ns, image in zip(CAMERAS, stamps_ns, images, strict=True)
             ]
             self._seq += 1
             if pair is None:
-                found = [name for name in CAMERAS if pairing.counts[f"repeated_{name}"] > before[f"repeated_{name}"]]
                 raise OmnidError(
-                    f"the image of the {' and the '.join(found)} camera is an earlier one, to the last pixel: leave "
-                    'such pairs out, as a frozen camera shows no motion, or set pair.repeated_images="use"'
+                    "an image is the one before of its camera, to the last pixel: leave such pairs out, as a frozen "
+                    'camera shows no motion, or set pair.repeated_images="use"'
                 )
             # 3. Estimate the motion.
             self._stamp_ns = stamp_ns

@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from importlib import import_module
 from itertools import dropwhile, takewhile
 from operator import methodcaller
-from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Final, NoReturn, cast
 
 from omnid.engine.process import handle_stop_signals
 from omnid.version import __version__
@@ -20,50 +20,45 @@ if TYPE_CHECKING:
     from omnid.commands.options import Command
 
 
-class Entry(NamedTuple):
-    """Where a command is, and its line in the list of commands."""
-
-    place: str  # module of omnid.commands, with :NAME where the command is not called `run` in it
-    help: str
-
-
-# Words of each command that has no subcommands -> its entry. A module is imported when its command is named.
-COMMANDS: Final[Mapping[str, Entry]] = {
-    "run": Entry("runs", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
-    "simulate": Entry("runs:simulate", "the daemon with a simulated robot in a simulated world"),
-    "replay": Entry("runs:replay", "run a recorded log through the stages of the daemon"),
-    "demo": Entry("runs:demo", "replay a sample in real time: files, bus and a simulated motor"),
-    "eval": Entry("recordings:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
-    "calibrate live": Entry("calibrate:live", "images of a board, with its coverage and what is missing"),
-    "calibrate rig": Entry("calibrate:of_board", "a rig.toml from images of a board that both cameras saw"),
-    "calibrate drive": Entry("calibrate:drive", "what drives say about a rig, and the rig that they make"),
-    "calibrate import": Entry(
-        "calibrate:import_rig", "a rig.toml from files of other programs, or of two 360-degree cameras"
+# Words of each command that has no subcommands -> its module of omnid.commands, with :NAME where it is not called `run`
+# in it, and its line in the list of commands. A module is imported when its command is named.
+COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
+    "run": ("runs", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
+    "simulate": ("runs:simulate", "the daemon with a simulated robot in a simulated world"),
+    "replay": ("runs:replay", "run a recorded log through the stages of the daemon"),
+    "demo": ("runs:demo", "replay a sample in real time: files, bus and a simulated motor"),
+    "eval": ("recordings:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
+    "calibrate live": ("calibrate:live", "images of a board, with its coverage and what is missing"),
+    "calibrate rig": ("calibrate:of_board", "a rig.toml from images of a board that both cameras saw"),
+    "calibrate drive": ("calibrate:drive", "what drives say about a rig, and the rig that they make"),
+    "calibrate import": (
+        "calibrate:import_rig",
+        "a rig.toml from files of other programs, or of two 360-degree cameras",
     ),
-    "cameras": Entry("machine:show_cameras", "list cameras and the udev rule to copy, or show what they see"),
-    "arm": Entry("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
-    "stop": Entry("robot:stop", "stop the wheels until `omnid arm`; everyone who can connect may"),
-    "drive": Entry("robot:drive", "drive a robot by the keyboard"),
-    "goto": Entry("robot:goto", "drive a robot to a pose, around obstacles"),
-    "route teach": Entry("robot:teach", "record a route while somebody drives (`omnid drive`, a joystick)"),
-    "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
-    "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
-    "route list": Entry("robot:list_routes", "the routes in navigation.routes, here"),
-    "listen": Entry("machine:listen", "show pose, state, rates and latencies of a robot"),
-    "view": Entry("recordings:view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
-    "web": Entry("machine:web", "a page with state, path, warnings, stop and arm"),
-    "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
-    "record": Entry("runs:record", "record both cameras to MCAP files until Ctrl-C"),
-    "report": Entry("recordings:report", "one HTML page about a recording: path, events, statistics"),
-    "log info": Entry("recordings:info", "topics, types, counts, times, attachments, and whether the log is whole"),
-    "map build": Entry("map:build", "build a map from logs, of one drive or of several in the same place"),
-    "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map"),
-    "map export": Entry("map:export", "write a map for other programs"),
-    "map save": Entry("robot:save_map", "ask a robot to save its map now, before it is switched off"),
-    "doctor": Entry("machine:doctor", "check cameras, motor, rig, rights, bus and disk"),
-    "motor test": Entry("machine:test_motor", "turn each wheel, ask what moved, print the settings for that"),
-    "config": Entry("machine:print_config", "print or check settings"),
-    "install-service": Entry("machine:install_service", "install omnid as a systemd service"),
+    "cameras": ("machine:show_cameras", "list cameras and the udev rule to copy, or show what they see"),
+    "arm": ("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
+    "stop": ("robot:stop", "stop the wheels until `omnid arm`; everyone who can connect may"),
+    "drive": ("robot:drive", "drive a robot by the keyboard"),
+    "goto": ("robot:goto", "drive a robot to a pose, around obstacles"),
+    "route teach": ("robot:teach", "record a route while somebody drives (`omnid drive`, a joystick)"),
+    "route repeat": ("robot:repeat", "drive a route, from where the robot is on it"),
+    "route stop": ("robot:end_route", "end the repetition, or the recording without a file"),
+    "route list": ("robot:list_routes", "the routes in navigation.routes, here"),
+    "listen": ("machine:listen", "show pose, state, rates and latencies of a robot"),
+    "view": ("recordings:view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
+    "web": ("machine:web", "a page with state, path, warnings, stop and arm"),
+    "batch": ("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
+    "record": ("runs:record", "record both cameras to MCAP files until Ctrl-C"),
+    "report": ("recordings:report", "one HTML page about a recording: path, events, statistics"),
+    "log info": ("recordings:info", "topics, types, counts, times, attachments, and whether the log is whole"),
+    "map build": ("map:build", "build a map from logs, of one drive or of several in the same place"),
+    "map show": ("map:show", "keyframes, sessions, loops, size, and the rig that made the map"),
+    "map export": ("map:export", "write a map for other programs"),
+    "map save": ("robot:save_map", "ask a robot to save its map now, before it is switched off"),
+    "doctor": ("machine:doctor", "check cameras, motor, rig, rights, bus and disk"),
+    "motor test": ("machine:test_motor", "turn each wheel, ask what moved, print the settings for that"),
+    "config": ("machine:print_config", "print or check settings"),
+    "install-service": ("machine:install_service", "install omnid as a systemd service"),
 }
 # First word of commands with subcommands -> its line in the list of commands.
 GROUPS: Final[Mapping[str, str]] = {
@@ -139,10 +134,10 @@ def parser_of(words: Sequence[str]) -> Parser:
             about = GROUPS[first]
             below = parents[""].add_parser(first, help=about, description=f"{about[:1].upper()}{about[1:]}.")
             parents[first] = below.add_subparsers(required=True, metavar="action", parser_class=Parser)
-        entry = COMMANDS[name]
-        leaf = parents[first if second else ""].add_parser(second or first, help=entry.help)
+        place, about = COMMANDS[name]
+        leaf = parents[first if second else ""].add_parser(second or first, help=about)
         if name == named:
-            command_at(entry).add_to(leaf)
+            command_at(place).add_to(leaf)
     if _completes():
         with suppress(ImportError):  # the extra `completion`
             import argcomplete
@@ -151,9 +146,9 @@ def parser_of(words: Sequence[str]) -> Parser:
     return parser
 
 
-def command_at(entry: Entry) -> Command:
+def command_at(place: str) -> Command:
     """Import a command."""
-    module, _, name = entry.place.partition(":")
+    module, _, name = place.partition(":")
     return cast("Command", getattr(import_module(f"omnid.commands.{module}"), name or "run"))
 
 

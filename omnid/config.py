@@ -10,7 +10,6 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from drivers.cameras.v4l2_device import V4l2Settings
-from drivers.errors import DriverError
 from drivers.logs.log_reader import TimeSource
 from drivers.logs.mcap_writer import RotationSettings
 from omnid.controller.motor import MotorSettings
@@ -74,13 +73,6 @@ class CamerasConfig:
         """Return the settings of the lower or the upper camera; DriverError if they contradict each other."""
         shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if hasattr(self, entry.name)}
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
-
-    def require_two_devices(self) -> None:
-        """Raise DriverError where one device is named for both cameras."""
-        if self.lower == self.upper:
-            raise DriverError(
-                f"cameras.lower and cameras.upper are both {self.lower!r}: expected two devices, see `omnid cameras`"
-            )
 
 
 @dataclass(frozen=True, slots=True)

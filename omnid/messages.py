@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from drivers.jpeg import Steps
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
@@ -89,15 +88,6 @@ class OdometryUpdate:
     T_odom_rect: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) the same pose, as it was estimated
     # covariance of T_odom_rect, [t; r] in the rectified axes, without the errors of the rig
     covariance_rect: Array = field(default_factory=lambda: np.zeros((6, 6)))
-
-    def __repr__(self) -> str:
-        """Return one line: number, state, position, heading and sigma of the position."""
-        x_m, y_m, z_m = self.position
-        sigma_mm = 1e3 * math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
-        return (
-            f"<pose {self.seq}: {self.state}, x {x_m:+.3f} y {y_m:+.3f} z {z_m:+.3f} m, "
-            f"heading {math.degrees(se3.yaw(self.T_odom_rig)):+.2f} deg, sigma {sigma_mm:.1f} mm>"
-        )
 
     @property
     def position(self) -> Array:

@@ -243,10 +243,9 @@ HEIGHT: Final = """
 
 
 def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:
-    """Return what opens a camera of the settings; its events are logged. Raise OmnidError unless there are two."""
+    """Return what opens a camera of the settings; its events are logged."""
     from drivers.cameras.v4l2_camera import V4l2Camera
 
-    config.cameras.require_two_devices()
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 

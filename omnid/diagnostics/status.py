@@ -77,7 +77,6 @@ class RunCounters:
     states: Mapping[TrackingState, int]  # poses in each state
     resets: int  # gaps in the trajectory after which tracking began again
     drops: Mapping[str, int]  # messages lost, by reason; zeros too
-    map: Mapping[str, int] = field(default_factory=dict)  # voxels and points; empty without a map
     places: Mapping[str, int] = field(default_factory=dict)  # keyframes, loops, refusals; empty without a map of places
     motor: Mapping[str, int] = field(default_factory=dict)  # commands, errors, stops; empty without a motor
     loss: str = ""  # one line where more than a tenth of the pairs is missing
@@ -115,7 +114,6 @@ def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str
         "poses": str(poses),
         "lost": listed(counters.drops, verbose),
         "resets": str(resets) if resets or verbose else "",
-        "map": listed(counters.map) if verbose else "",
         "places": listed(counters.places) if verbose else "",
         "motor": "{commands} commands sent, {errors} errors, {stops} stops".format_map(motor) if motor else "",
         "length": f"{counters.length_m:.4f} m",
@@ -252,8 +250,6 @@ class StatusCollector:
             Key.RUN: status_names.RUN_ID,
             Key.RESETS: newest.reset_counter,
             "length_m": self._statistics.length_m,
-            "level_grey": newest.light.level_grey,
-            "contrast_to_noise": newest.light.contrast_to_noise,
             **times(status_names.CAPTURE_TO_POSE, self._statistics.to_pose),
             **({"_stale": "no new pose"} if age_s > TIMEOUT_S else {severity: f"{state}: {fault}" if fault else state}),
         }

@@ -5,13 +5,11 @@ A check yields a finding for each fault, with what to do, or else one of level o
 
 from __future__ import annotations
 
-import grp
 import os
 import re
 import shutil
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
@@ -27,7 +25,6 @@ from omnid.errors import OmnidError
 from omnid.transport.session import BusConfig, zenoh_config
 
 Level = Literal["ok", "warning", "error"]
-GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
 STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
 
 
@@ -85,19 +82,11 @@ def motor(settings: MotorSettings, root: Path = Path("/")) -> Iterator[Finding]:
 
 
 def access(subject: str, device: Path) -> Finding | None:
-    """Return a finding if the service or this user may not open the device."""
-    found = device.stat()
-    group = str(found.st_gid)
-    with suppress(KeyError):  # a group without a name
-        group = grp.getgrgid(found.st_gid).gr_name
-    if group not in GROUPS and not (found.st_mode & stat.S_IROTH and found.st_mode & stat.S_IWOTH):
-        closed = f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}"
-        rule = 'set GROUP="video" or GROUP="dialout" in its udev rule, see 90-omnid.rules'
-        return Finding("warning", subject, closed, rule)
-    if not os.access(device, os.R_OK | os.W_OK):
-        join = f"`sudo usermod -aG {group} $USER`, then log in again"
-        return Finding("error", subject, f"no permission for {device} of group {group}", join)
-    return None
+    """Return a finding if this user may not open the device."""
+    if os.access(device, os.R_OK | os.W_OK):
+        return None
+    join = "`sudo usermod -aG video,dialout $USER`, then log in again; the service is in both groups"
+    return Finding("error", subject, f"no permission for {device}", join)
 
 
 def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:

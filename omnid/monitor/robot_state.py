@@ -196,8 +196,7 @@ def pose_lines(robot: str, state: RobotState) -> Iterator[str]:
         f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
         f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
     )
-    pace = f"{state.real_time_factor} x real time  " if state.real_time_factor else ""
-    yield f"  {pace}missed {state.missed}  unreadable {state.broken}"
+    yield f"  missed {state.missed}  unreadable {state.broken}"
 
 
 def status_table(robot: str, state: RobotState) -> Iterator[str]:

@@ -254,7 +254,6 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
     }
     if controller is not None:
         session.parts[names.WHEELS] = partial(wheel_stats, controller.statistics, commands)
-        session.parts[names.REQUESTS] = commands.requests.stats
     if stages.places is not None:
         session.parts[names.PLACES] = stages.places.stats
     if run_places.saves:
@@ -338,26 +337,23 @@ class Service:
 
     def __init__(self, telemetry: Telemetry, statistics: RunStatistics, stall_timeout_s: float) -> None:
         """stall_timeout_s: longest time that a stage may work on one message."""
-        self._telemetry, self._statistics, self._stall_timeout_s = telemetry, statistics, stall_timeout_s
-        self._was_stalled = False
-        self._poses, self._called_ns = 0, time.monotonic_ns()
+        self._telemetry, self._statistics = telemetry, statistics
+        self._stall_ns, self._was_stalled, self._poses = stall_timeout_s / S_PER_NS, False, 0
 
     def __call__(self) -> None:
         """Notify systemd."""
         # 1. Stages that work on one message for too long.
         now_ns, found = time.monotonic_ns(), self._statistics
         busy = [(stage.name, stage.busy_since_ns) for stage in self._telemetry.stages]
-        limit_ns = self._stall_timeout_s / S_PER_NS
-        stalled = [name for name, since_ns in busy if since_ns and now_ns - since_ns > limit_ns]
+        stalled = [name for name, since_ns in busy if since_ns and now_ns - since_ns > self._stall_ns]
         if stalled and not self._was_stalled:
             log(logging.ERROR, f"stalled: {', '.join(stalled)}; the watchdog of systemd is no longer fed")
         self._was_stalled = bool(stalled)
-        # 2. State, poses per second since the last call, what was lost.
-        rate_hz = (found.poses - self._poses) / max(1e-3, (now_ns - self._called_ns) * S_PER_NS)
-        self._poses, self._called_ns = found.poses, now_ns
-        state = found.newest.state if found.newest is not None and rate_hz > 0 else "waiting for images"
+        # 2. State, and what was lost.
+        has_new, self._poses = found.poses > self._poses, found.poses
+        state = found.newest.state if found.newest is not None and has_new else "waiting for images"
         dropped, late = self._telemetry.lost(by_tickers=False), self._telemetry.lost(by_tickers=True)
-        line = f"{found.length_m:.2f} m, {state}, {rate_hz:.1f} poses/s, {dropped} messages dropped, {late} ticks late"
+        line = f"{found.length_m:.2f} m, {state}, {dropped} messages dropped, {late} ticks late"
         line = f"stalled: {', '.join(stalled)}" if stalled else line
         HANDLER.show(line)
         notify("READY=1", *([] if stalled else ["WATCHDOG=1"]), f"STATUS={one_line(line)}")

@@ -236,7 +236,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             {state: found.states[state] for state in TrackingState},
             found.resets,
             drops,
-            {} if stages.mapping is None else stages.mapping.counts,
             {} if stages.places is None else stages.places.counts,
             {} if wheels is None else wheels.counts(),
             "" if drops["queue"] else pair_loss(front_end.pairing, read),  # else they were dropped on purpose

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -29,7 +30,7 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.files import RouteFiles, RunPlaces
 from omnid.settings import dump
-from omnid.sinks.drive import LiveDrive, navigation_answers, planner_setpoint
+from omnid.sinks.drive import LiveDrive, navigation_answers, send_setpoint
 from omnid.sinks.encoder import Encoder, Outgoing, UnixTime
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry, with_rims
@@ -176,7 +177,6 @@ class Outputs:
 class WiredStages(NamedTuple):
     """The stages that are asked for counts and warnings."""
 
-    mapping: Mapping | None
     places: Places | None
     obstacles: Obstacles | None
 
@@ -192,7 +192,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     T_base_rig = geometry.rig.T_base_rig
     T_base_rect = T_base_rig @ geometry.T_rig_rect
     takes_all = outputs.bus is not None or outputs.recorder is not None
-    mapping, places, obstacles = None, None, None
+    places, obstacles = None, None
     commands, maps, in_map, grids, scans, ways = None, None, None, None, None, None
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
@@ -237,8 +237,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         answers.append(graph.stage("answers", navigation_answers, ways, thread=ways.thread))
         answers.append(graph.stage("taught", files.write, ways, thread=FILES))
         if controller is not None:
-            setpoints = graph.stage("planner", planner_setpoint, ways, thread=ways.thread)
-            graph.sink("planner-drive", controller.send, setpoints, thread=ways.thread)
+            graph.sink("planner-drive", partial(send_setpoint, controller), ways, thread=ways.thread)
 
     # 5. What is made is consumed, and leaves the run.
     consumed: list[tuple[dict[str, Any], Stream[Any] | None, str]] = [
@@ -276,7 +275,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
     graph.sink("keyframes", lambda _: front_end.complete(), poses, thread=poses.thread)
-    return WiredStages(mapping, places, obstacles)
+    return WiredStages(places, obstacles)
 
 
 def wheel_state(state: ControllerState) -> WheelState:

@@ -42,11 +42,10 @@ class LiveDrive:
         self._link.end()
 
 
-def planner_setpoint(update: NavigationUpdate) -> TimedSetpoint | None:
-    """Return the setpoint of the navigation as of now, which a source of higher priority keeps out."""
-    if update.setpoint is None:
-        return None
-    return TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER)
+def send_setpoint(link: DriveLink, update: NavigationUpdate) -> None:
+    """Send the setpoint of the navigation as of now, which a source of higher priority keeps out."""
+    if update.setpoint is not None:
+        link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
 
 
 def navigation_answers(update: NavigationUpdate) -> Answers | None:

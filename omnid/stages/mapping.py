@@ -53,11 +53,6 @@ class Mapping:
         self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
         self._frames = 0  # number of pairs that entered the map
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Voxels of the map."""
-        return {"voxels": len(self._map)}
-
     def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
         """Add the points of a pair; return the map when it is due."""
         # 1. The path has all poses, the map the points of those pairs that are due.

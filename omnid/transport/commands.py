@@ -39,7 +39,6 @@ from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport import codec, topics
 from omnid.transport.sensor_codec import LARGEST_VALUE
-from omnid.transport.status_names import REFUSED_PREFIX, by_reason
 from omnid.transport.topics import Answer, Request
 
 LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
@@ -113,10 +112,6 @@ class MessageCounts:
     accepted: int = 0
     refused: Counter[str] = field(default_factory=Counter)  # by reason
     refusal: str = ""  # the newest one
-
-    def stats(self) -> dict[str, object]:
-        """Return how many were accepted, and how many were not valid, by reason."""
-        return {"accepted": self.accepted, **by_reason(REFUSED_PREFIX, self.refused)}
 
 
 class CommandReceiver:

@@ -37,7 +37,6 @@ MOTION: Final = f"{PREFIX}wheels and gyro"  # in addition to the cameras
 PLACES: Final = f"{PREFIX}places"
 MAP_FILE: Final = f"{PREFIX}map file"
 NAVIGATION: Final = f"{PREFIX}navigation"  # on its own topic
-REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 IMAGES: Final = f"{PREFIX}images"  # parts of them that are frozen or blind
 EXPOSURE: Final = f"{PREFIX}exposure"
 CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`

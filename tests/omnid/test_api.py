@@ -179,11 +179,8 @@ def test_an_image_that_repeats_an_earlier_one_is_refused_and_changes_nothing(sce
         pose, expected = odometry.process(stamp_ns, *buffers), whole.process(stamp_ns, *images)
         assert np.array_equal(pose.T_odom_rig, expected.T_odom_rig)
         used.process(stamp_ns, *images)
-        for lower, upper, found in (
-            (*images, "lower and the upper camera"),
-            (images[0], images[1] ^ np.uint8(number + 1), "the lower camera"),
-        ):
-            with pytest.raises(OmnidError, match=f"image of the {found.removeprefix('the ')} is an earlier one"):
+        for lower, upper in (images, (images[0], images[1] ^ np.uint8(number + 1))):
+            with pytest.raises(OmnidError, match="is the one before of its camera"):
                 odometry.process(stamp_ns + 1, lower, upper)
         used.process(stamp_ns + 1, *images)
     for later_ns in (1, 2):

@@ -17,7 +17,7 @@ from omnid.plain_text import MOST_CHARACTERS, one_line, plain
 from omnid.settings import value_at
 from tests.omnid.commands.test_batch import short_log
 
-EXAMPLES = {words: command_at(entry).examples for words, entry in COMMANDS.items()}
+EXAMPLES = {words: command_at(place).examples for words, (place, _) in COMMANDS.items()}
 
 
 def test_no_words_are_a_question_for_help(capsys: pytest.CaptureFixture[str]) -> None:

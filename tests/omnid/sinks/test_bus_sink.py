@@ -28,7 +28,7 @@ from omnid.core.types.panorama import PaddedPanorama
 from omnid.engine.graph import StageStats
 from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.sinks.drive import ReplayDrive, navigation_answers, planner_setpoint
+from omnid.sinks.drive import ReplayDrive, navigation_answers, send_setpoint
 from omnid.sinks.encoder import BusSink, Encoder, Outgoing, PanoramaSink
 from omnid.tracking_state import TrackingState
 from omnid.transport.bus import Bus, BusConfig
@@ -221,10 +221,11 @@ def test_no_pose_of_a_replay_drives_before_its_rig_is_checked(link: Any) -> None
     assert len(link.poses) == len(link.setpoints) == 2
 
 
-def test_setpoints_and_answers_of_the_navigation() -> None:
+def test_setpoints_and_answers_of_the_navigation(link: Any) -> None:
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
     refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
     assert navigation_answers(update) == {4: Answer(True, "pause: paused: by a request")}
     assert navigation_answers(refused) == {5: Answer(False, "no route lost")}
-    setpoint = planner_setpoint(update)
-    assert setpoint is not None and setpoint.setpoint == AHEAD and planner_setpoint(refused) is None
+    for each in (update, refused):
+        send_setpoint(link, each)
+    assert len(link.setpoints) == 1
