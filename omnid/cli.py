@@ -68,7 +68,6 @@ GROUPS: Final[Mapping[str, str]] = {
     "map": "build, show and export maps of places (.omap)",
     "motor": "test the wiring of the motors: sides, directions, scale",
 }
-WRONG_INPUT = 2
 
 
 class Parser(argparse.ArgumentParser):
@@ -76,7 +75,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the error and end the program."""
-        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}; see {self.prog} --help\n")
+        self.exit(2, f"omnid: {' '.join(message.split())}; see {self.prog} --help\n")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -108,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except (OmnidError, DriverError, CalibError) as error:
         log(logging.ERROR, str(error))
-        return WRONG_INPUT
+        return 2
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # the reader of the output has gone, such as `head`
@@ -117,7 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:  # not handled by the command: a full disk, a file name that is too long
         log(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
         _discard_stdout()
-        return WRONG_INPUT
+        return 2
 
 
 def parser_of(words: Sequence[str]) -> Parser:

@@ -1,7 +1,7 @@
 """Stamps as text, and texts from outside made safe to show: names of files, messages, errors that quote them.
 
 A terminal, a table and a page show the same: control characters, line breaks, characters that change the direction of
-writing, and bytes of a file name that are no UTF-8 appear as escapes such as \\x1b.
+writing, and bytes of a file name that are no UTF-8 (PEP 383) appear as escapes such as \\x1b.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import Final
 MOST_CHARACTERS: Final = 400
 MOST_ENTRIES: Final = 64  # of parts in a status, and of values in a part
 UNIX_TIMES_S: Final = (10**9, 2**33)  # 2001 to 2242; the clock of a simulation or of a camera is outside
-_NO_UTF8: Final = range(0xDC80, 0xDD00)  # how Python keeps a byte of a file name that is no UTF-8 (PEP 383)
 
 
 def plain(text: str, most: int = MOST_CHARACTERS) -> str:
@@ -27,10 +26,7 @@ def one_line(message: object, most: int = MOST_CHARACTERS) -> str:
 
 
 def _shown(letter: str) -> str:
-    if letter.isprintable():
-        return letter
-    number = ord(letter)
-    return f"\\x{number & 0xFF:02x}" if number in _NO_UTF8 else letter.encode("unicode_escape").decode("ascii")
+    return letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
 
 
 def utc(stamp_ns: int) -> str:

@@ -39,4 +39,5 @@ def prepare_kernels(report: Report = log) -> None:
     except Exception as error:  # what pickle and LLVM raise for files that a power cut has damaged
         for name in modules:
             shutil.rmtree(code_folder(name), ignore_errors=True)
-        raise OmnidError("what was compiled earlier is damaged; it is deleted now: start again") from error
+        text = f"what was compiled earlier is damaged ({error}); it is deleted now: start again"
+        raise OmnidError(text) from error

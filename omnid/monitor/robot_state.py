@@ -23,12 +23,11 @@ from omnid.navigation_state import NavigationState
 from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
 from omnid.transport.session import PERIOD_S, BusConfig
-from omnid.transport.status_names import DISARMED_BY_STOP, SIMULATION, STAGE_PREFIX, WHEELS, Key, short_name
+from omnid.transport.status_names import DISARMED_BY_STOP, SIMULATION, STAGE_PREFIX, TIMEOUT_S, WHEELS, Key, short_name
 from omnid.transport.stop_datagram import STOPPED, StopSender
 from omnid.transport.topics import PUBLISHED
 
 LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
-NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
 _INBOX_DEPTH: Final = 2000
 _RECENT: Final = 100  # poses
 
@@ -130,7 +129,7 @@ class RobotState:
     @property
     def rate_hz(self) -> float:
         """Rate of the last poses; 0 where there are none."""
-        if len(self._arrivals_s) < 2 or self.time_since_pose_s > NO_POSE_S:
+        if len(self._arrivals_s) < 2 or self.time_since_pose_s > TIMEOUT_S:
             return 0.0
         return (len(self._arrivals_s) - 1) / max(1e-6, self._arrivals_s[-1] - self._arrivals_s[0])
 
@@ -139,7 +138,7 @@ class RobotState:
         """Tracking state of the newest pose, or the time since it and whether the daemon is still there."""
         if self.pose is None:
             return "no pose yet: no robot of this name is there" if self.alive is None else "no pose yet"
-        if self.time_since_pose_s > NO_POSE_S:
+        if self.time_since_pose_s > TIMEOUT_S:
             gone = ", its daemon has ended or cannot be reached" if self.alive is False else ""
             return f"no pose for {self.time_since_pose_s:.0f} s{gone}"
         return plain(self.pose.state)

@@ -30,7 +30,6 @@ PERIOD_S: Final = 0.05  # Period of the commands.
 # Time for which a key counts as pressed: longer than the pause before a terminal repeats it. Zero is sent as long after
 # a motion; then nothing, so that others may drive.
 HOLD_S: Final = 0.6
-FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
 _SIDES: Final = {b"A": (0, 1), b"B": (0, -1), b"D": (1, 1), b"C": (1, -1)}  # axis of the stick, and its side
 # A terminal sends ESC [ A or, in its application mode, ESC O A.
 ARROWS: Final = {begin + letter: side for letter, side in _SIDES.items() for begin in (b"\x1b[", b"\x1bO")}
@@ -43,7 +42,7 @@ class Stick:
     """Keys as a stick: each axis is held for HOLD_S after its last key."""
 
     limits: VelocityLimits
-    share: float = FIRST_SHARE
+    share: float = 0.4  # of the highest speeds, at the start
     stop_asked: bool = False
     arm_asked: bool = False
     quit: bool = False

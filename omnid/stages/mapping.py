@@ -127,9 +127,6 @@ class MapGrid:
         return GridUpdate(newest.seq, newest.stamp_ns, self._grid.draw(newest.scans, self._T_base_rect))
 
 
-Array = NDArray[np.float64]
-
-
 class Places:
     """Localise the poses of odometry in a map of places, which grows with them.
 

@@ -22,7 +22,7 @@ from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.ray_scans import RayScans
-from omnid.core.stereo.tiles import tile_columns
+from omnid.core.stereo.tiles import TILE_COLUMNS, tile_columns
 from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
 from omnid.stages.geometry import DenseDepths, Geometry
 from omnid.tracking_state import TrackingState
@@ -75,7 +75,6 @@ NOT_FREE: Final = np.zeros(SECTORS, np.float32)
 
 # A direction of the cameras is one of the base only far away, because the viewpoint may lie off the base's origin.
 UNWATCHED_M: Final = (0.3, 0.6, 1.2, 2.5, 5.0, math.inf)
-SAMPLES: Final = 13  # across a tile of 6 degrees, so that each sector has two
 
 
 def sectors_of(tiles: Flags, cylinder: Cylinder, T_base_rect: Array, ranges_m: Sequence[float]) -> Flags:
@@ -85,7 +84,8 @@ def sectors_of(tiles: Flags, cylinder: Cylinder, T_base_rect: Array, ranges_m: S
     """
     found = np.zeros(SECTORS, bool)
     width_px = cylinder.width / tile_columns(cylinder)
-    columns = ((np.flatnonzero(tiles)[:, None] + np.linspace(0.0, 1.0, SAMPLES)) * width_px - 0.5).ravel()
+    across = np.linspace(0.0, 1.0, 2 * SECTORS // TILE_COLUMNS + 1)  # a tile, so that each sector has two samples
+    columns = ((np.flatnonzero(tiles)[:, None] + across) * width_px - 0.5).ravel()
     rays = cylinder.rays(np.column_stack([columns, np.full(columns.size, cylinder.row0)]))
     direction = (rays @ T_base_rect[:3, :3].T)[:, :2]
     x, y = np.moveaxis(direction + T_base_rect[:2, 3] / np.array(ranges_m)[:, None, None], -1, 0)

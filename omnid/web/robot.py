@@ -27,7 +27,7 @@ from omnid.core.control.heading_controller import VelocityLimits
 from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, navigation_verb, route_request
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import stop
-from omnid.monitor.teleop import FIRST_SHARE, limits_of
+from omnid.monitor.teleop import Stick, limits_of
 from omnid.web.feed import OLDEST_S, RobotFeed, is_recent, server_ms
 
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
@@ -167,8 +167,8 @@ class RobotPage:
             return Answer(False, "the robot does not take the last command: is it overloaded?")
         # 3. Send it. Other pages are refused until a state would be too old: some requests of this one may be lost.
         self._page, self._held_until_s = page, time.monotonic() + OLDEST_S
-        velocity_mps = FIRST_SHARE * forward * limits.velocity_mps
-        rate_radps = FIRST_SHARE * turn * limits.yaw_rate_radps
+        velocity_mps = Stick.share * forward * limits.velocity_mps
+        rate_radps = Stick.share * turn * limits.yaw_rate_radps
         send = partial(robot.driver().twist, velocity_mps, rate_radps)
         self._sending = asyncio.get_running_loop().run_in_executor(self._stick_thread, send)
         await asyncio.wait([self._sending], timeout=ANSWER_S / 2)  # a robot that does not read is not waited for

@@ -46,7 +46,7 @@ from starlette.requests import Request as WebRequest
 from starlette.routing import Route
 
 from omnid.client import Robot
-from omnid.monitor.teleop import FIRST_SHARE
+from omnid.monitor.teleop import Stick
 from omnid.web import feed, robot
 from omnid.web.robot import RobotPage
 from tests.waiting import wait_until
@@ -160,7 +160,7 @@ def test_a_stop_ends_once_it_is_confirmed_whoever_asks_for_it(rover: Rover) -> N
 
 
 def test_the_stick_sends_a_share_of_the_limits(rover: Rover, page: RobotPage, clock_ms: list[int]) -> None:
-    mps, radps = FIRST_SHARE * 0.7, FIRST_SHARE * 1.5
+    mps, radps = Stick.share * 0.7, Stick.share * 1.5
 
     def answer(forward: float, turn: float, name: str = "a", late_ms: int = 0) -> Answer:
         return post(page, "/drive", f"{forward:g} {turn:g} {clock_ms[0] - late_ms} {name}")
