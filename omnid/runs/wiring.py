@@ -262,7 +262,9 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     if outputs.answers is not None:
         graph.sink("answer", outputs.answers, *answers, thread=BUS, depth=MOST_OPEN)
     if outputs.recorder is not None:
-        images = inputs.frames if inputs.reports is not None else ()
+        images: Sequence[Stream[Any]] = ()
+        if inputs.reports is not None:
+            images = (pairs,) if config.record.images_hz else inputs.frames
         depth = RECORDED_DEPTH if inputs.reports is not None else 0
         made = (stream for _, stream, _ in leaving if stream is not None)
         graph.sink("record", outputs.recorder, *images, *made, depth=depth)

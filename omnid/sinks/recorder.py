@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -12,11 +11,12 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotatingLogState
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.engine.robot_clock import RobotClock, log_time
+from omnid.messages import FramePair
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.topics import ros_name
 
-Recorded: TypeAlias = Frame | Outgoing
+Recorded: TypeAlias = Frame | FramePair | Outgoing
 
 
 class SingleLog:
@@ -47,32 +47,6 @@ class SingleLog:
             self._writer.close()
 
 
-class ThinnedPairs:
-    """Passes pairs of images on at a bounded rate: a lower image that is due, and the upper one nearest in time."""
-
-    def __init__(self, rate_hz: float) -> None:
-        """rate_hz: pairs a second; 0: all images."""
-        self._period_ns = round(NS_PER_S / rate_hz) if rate_hz else 0
-        self._periods = -1  # of the newest lower image that was passed on
-        self._wanted_ns: int | None = None  # its stamp, while its partner has not come
-        self._upper: deque[Frame] = deque(maxlen=3)  # the newest ones
-
-    def take(self, frame: Frame) -> list[Frame]:
-        """Take the next image of a camera; return those to pass on."""
-        if not self._period_ns:
-            return [frame]
-        found = []
-        if frame.camera != "lower":
-            self._upper.append(frame)
-        elif frame.stamp_ns // self._period_ns > self._periods:
-            self._periods, self._wanted_ns = frame.stamp_ns // self._period_ns, frame.stamp_ns
-            found.append(frame)
-        if (wanted_ns := self._wanted_ns) is not None and self._upper and self._upper[-1].stamp_ns >= wanted_ns:
-            found.append(min(self._upper, key=lambda upper: abs(upper.stamp_ns - wanted_ns)))
-            self._wanted_ns = None
-        return found
-
-
 class Recorder:
     """A sink that writes every message under `/<robot>/`.
 
@@ -94,12 +68,12 @@ class Recorder:
     ) -> None:
         """clock: that of the stamps, None: they are Unix time; the encoder has its segment_unix_ns.
 
-        images_hz: pairs of images a second that are recorded; 0: all.
+        images_hz: pairs a second of which the images are recorded; 0: of all. Single images are recorded in any case.
         """
         self._log, self._robot, self._encode = log, robot, encode
         self._clock = clock or log_time()
         self._steps = self._clock.steps
-        self._thinned = ThinnedPairs(images_hz)
+        self._period_ns, self._periods = round(NS_PER_S / images_hz) if images_hz else 1, -1
         self._files = 0
         self.newest_ns = 0
 
@@ -126,12 +100,15 @@ class Recorder:
             encode.repeat_states()
         self._files = self.state.files
         # 3. The message.
-        if isinstance(message, Frame):
-            for frame in self._thinned.take(message):
-                frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
-                self._write([(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
-        elif encode is not None:
+        frames = (message,) if isinstance(message, Frame) else ()
+        if isinstance(message, FramePair):
+            before, self._periods = self._periods, message.stamp_ns // self._period_ns
+            frames = message.frames if self._periods != before else ()
+        elif encode is not None and not isinstance(message, Frame):
             self._write(encode(message), stamp_ns)
+        for frame in frames:
+            frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
+            self._write([(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
         self.newest_ns = max(self.newest_ns, stamp_ns)
 
     def close(self) -> None:

@@ -275,9 +275,8 @@ class Synchronise:
         # 3. The pair.
         self._pairs += 1
         skew_s, motion = self.skew.exposure_ns * S_PER_NS, self.motion.take(lower.stamp_ns)
-        return FramePair(
-            self._pairs - 1, lower.stamp_ns, *images, skew_s, motion, (coding_steps(lower), coding_steps(upper))
-        )
+        steps = coding_steps(lower), coding_steps(upper)
+        return FramePair(self._pairs - 1, lower.stamp_ns, *images, skew_s, motion, steps, frames)
 
 
 def _gap_ns(frames: tuple[Frame, Frame]) -> int:

@@ -20,7 +20,7 @@ from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.types.panorama import PaddedPanorama, Panoramas
 from omnid.engine.robot_clock import RobotClock
-from omnid.messages import MapUpdate, OdometryUpdate, StereoDepth
+from omnid.messages import FramePair, MapUpdate, OdometryUpdate, StereoDepth
 from omnid.runs.live import open_recorder
 from omnid.sinks.encoder import Encoder
 from omnid.transport.codec import ERROR, OK, Diagnostics, DiagnosticStatus
@@ -79,17 +79,15 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
         assert np.array_equal(gray(read), gray(each))
 
 
-@pytest.mark.parametrize("upper_first", [False, True])
 @pytest.mark.parametrize("skew_ns", [-16_000_000, 100_000, 16_000_000])
-def test_a_recording_of_fewer_images_holds_whole_pairs(tmp_path: Path, skew_ns: int, upper_first: bool) -> None:
+def test_a_recording_of_fewer_images_holds_whole_pairs(tmp_path: Path, skew_ns: int) -> None:
     """Of three seconds at 30 Hz 15 pairs at 5 Hz; the images of each are as far apart as the cameras are."""
     config = settings(tmp_path, images_hz=5.0)
     recorder = open_recorder(config, "", lambda *_: None, clock=set_clock(), encode=Encoder(np.eye(4), 0))
     for n in range(92):
         lower, upper = frame(n, "lower"), frame(n, "upper")
         upper = replace(upper, stamp_ns=upper.stamp_ns + skew_ns)
-        for each in (upper, lower) if upper_first else (lower, upper):
-            recorder.process(each)
+        recorder.process(FramePair(n, lower.stamp_ns, gray(lower), gray(upper), frames=(lower, upper)))
     recorder.close()
     found = list(LogReader(recorded(tmp_path)[0]).frames())
     stamps = {camera: [one.stamp_ns for one in found if one.camera == camera] for camera in ("lower", "upper")}
