@@ -21,7 +21,7 @@ from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.commands import options
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
-from omnid.diagnostics.status import Progress, summary_entries, timing_table
+from omnid.diagnostics.status import show_progress, summary_entries, timing_table
 from omnid.engine.graph import nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
@@ -183,7 +183,7 @@ def replay_and_print(log: Path, config: Config, asked: ReplayOptions, args: argp
 
     args: --quiet, --verbose, and perhaps --json.
     """
-    result = run_log(log, config, asked if args.quiet else replace(asked, progress=Progress()))
+    result = run_log(log, config, asked if args.quiet else replace(asked, progress=show_progress))
     for warning in result.warnings:
         options.warn(warning)
     if getattr(args, "json", False):

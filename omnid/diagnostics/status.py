@@ -131,22 +131,13 @@ def timing_table(timings: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
     yield ""
 
 
-class Progress:
-    """Shows how far a run over a log is, in a line that a terminal keeps showing."""
-
-    def __init__(self) -> None:
-        self._start_s = time.monotonic()
-
-    def __call__(self, statistics: RunStatistics, expected: int | None, ended: bool) -> None:
-        """Show the progress now; ended: remove it."""
-        newest = statistics.newest
-        if ended or newest is None:
-            HANDLER.show("")
-            return
-        done, passed_s = newest.seq + 1, time.monotonic() - self._start_s
-        share = f"{done}/{expected}" if expected else f"{done}"
-        rate = done / max(1e-3, passed_s)
-        HANDLER.show(f"{share} pairs, {rate:.1f} pairs/s, {statistics.length_m:.2f} m, {newest.state}")
+def show_progress(statistics: RunStatistics, expected: int | None, ended: bool) -> None:
+    """Show how far a run over a log is, in a line that a terminal keeps showing; ended: remove it."""
+    newest = statistics.newest
+    if ended or newest is None:
+        HANDLER.show("")
+    else:
+        HANDLER.show(f"{newest.seq + 1} of {expected or '?'} pairs, {statistics.length_m:.2f} m, {newest.state}")
 
 
 def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
