@@ -12,7 +12,7 @@ from typing import Final
 from omnid.commands import options
 from omnid.core.places import place_views
 from omnid.core.places.place_map import PlaceMap, PlaceRig
-from omnid.diagnostics.status import Progress
+from omnid.diagnostics.status import show_progress
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_grid, write_ply
 from omnid.formats.place_file import read_places, write_places
@@ -52,7 +52,7 @@ def build(args: argparse.Namespace) -> int:
         if args.extend:
             write_places(new, *read_places(args.output))
         config = replace(config, places=replace(config.places, map=str(new)))
-        replayed = ReplayOptions(rig=args.rig, settings=args.config, progress=None if args.quiet else Progress())
+        replayed = ReplayOptions(rig=args.rig, settings=args.config, progress=None if args.quiet else show_progress)
         for log in args.logs:
             result = run_log(log, config, replayed)
             for warning in result.warnings:

@@ -100,7 +100,7 @@ class Recorder:
             encode.repeat_states()
         self._files = self.state.files
         # 3. The message.
-        frames = (message,) if isinstance(message, Frame) else ()
+        frames: tuple[Frame, ...] = (message,) if isinstance(message, Frame) else ()
         if isinstance(message, FramePair):
             before, self._periods = self._periods, message.stamp_ns // self._period_ns
             frames = message.frames if self._periods != before else ()
