@@ -30,7 +30,7 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
 
     Leaves no file behind. Raises OmnidError.
     """
-    used = {path.resolve(): what for what, path in inputs}
+    used = {_identity(path): what for what, path in inputs}
     for option, path in outputs:
         wrong = ""
         if path.is_dir():
@@ -39,7 +39,7 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             wrong = f"there is no folder {path.parent}"
         elif path.exists() and not path.is_file():  # not opened: a pipe that is opened would end its reader
             wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
-        elif (other := used.setdefault(path.resolve(), option)) != option:
+        elif (other := used.setdefault(_identity(path), option)) != option:
             wrong = f"this is {other} as well"
         elif is_locked(path):
             wrong = "another program is writing it"
@@ -47,6 +47,11 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             wrong = "it may not be written"
         if wrong:
             raise OmnidError(f"{option} {path}: {wrong}; name another file")
+
+
+def _identity(path: Path) -> object:
+    """Return a key that is the same for all names of a file, hard and symbolic links included."""
+    return (path.stat().st_dev, path.stat().st_ino) if path.exists() else path.resolve()
 
 
 class TrajectoryFile:

@@ -48,7 +48,7 @@ def test_every_example_is_accepted(example: str) -> None:
 @pytest.mark.parametrize("words", COMMANDS)
 def test_options_stand_for_settings_that_exist(words: str) -> None:
     parser = argparse.ArgumentParser()
-    command_at(COMMANDS[words]).add_to(parser)
+    command_at(COMMANDS[words][0]).add_to(parser)
     for action in parser._actions:
         if setting := getattr(action, "setting", None):
             value_at(Config(), setting)

@@ -137,7 +137,6 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
         "/rover/pose": FEW_PAIRS,
         "/rover/map_pose": FEW_PAIRS,
         "/tf": 2 * FEW_PAIRS,
-        "/rover/drive": FEW_PAIRS,
         "/rover/cloud": 1,
         "/rover/map": 1,
         "/rover/status": 3,
