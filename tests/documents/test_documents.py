@@ -66,7 +66,7 @@ def unknown_words(words: list[str]) -> list[str]:
     if name is None:
         return words[:1]
     known = argparse.ArgumentParser()
-    cli.command_at(cli.COMMANDS[name]).add_to(known)
+    cli.command_at(cli.COMMANDS[name][0]).add_to(known)
     options = {option for action in known._actions for option in action.option_strings}
     return [word for word in words if re.fullmatch("--[a-z-]+", word) and word not in options]
 
