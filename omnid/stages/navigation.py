@@ -47,6 +47,7 @@ Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | WheelState | NavigationCommand
 
 REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
+SCAN_NS = 2_000_000_000  # older scans show nothing of now: the collision monitor then stops the base
 
 
 class NavigationStage:
@@ -134,9 +135,7 @@ class NavigationStage:
     def _surroundings(self, now_ns: int) -> Surroundings | None:
         """Return what the newest scan shows; None if it is too old, or nothing is under way."""
         scan, before = self._scan, self._around
-        # Older scans show nothing of now: the collision monitor then stops the base.
-        stale_ns = self._collision.stale_s * NS_PER_S
-        is_young = scan is not None and 0 <= now_ns - scan.stamp_ns <= stale_ns
+        is_young = scan is not None and 0 <= now_ns - scan.stamp_ns <= SCAN_NS
         if self._navigator.drive is None or scan is None or scan.grid is None or not is_young:
             return None
         if before is None or before.stamp_ns != scan.stamp_ns:
