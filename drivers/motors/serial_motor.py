@@ -28,9 +28,8 @@ import serial  # type: ignore[import-untyped]
 from drivers.backoff import Backoff
 from drivers.errors import DriverError, one_line
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
-from drivers.motors.protocols.motor_protocol import MotorProtocol, NoReplyError, T, Transaction
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, MotorProtocol, NoReplyError, T, Transaction
 from drivers.motors.protocols.odrive_ascii import ODriveAscii
 from drivers.motors.protocols.roboteq import Roboteq
 from drivers.motors.protocols.vesc import Vesc

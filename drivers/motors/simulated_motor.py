@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import DifferentialDrive
 
 STEP_S = 0.005  # Step of the integration.
 REACHED = 1e-3  # m/s or rad/s: friction ends the lag

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from drivers.errors import DriverError
 from drivers.motor import MotorDriver
-from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import DifferentialDrive
 
 SIMULATED: Final = "simulated"
 # Share of a tick's time that an answer may take: a missing one must not make the next tick late.

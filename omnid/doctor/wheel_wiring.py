@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Final
 
 from drivers.motor import MotorDriver, VelocityCommand, stop_command
-from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import DifferentialDrive
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.motor import MotorSettings, open_motor
 from omnid.errors import OmnidError

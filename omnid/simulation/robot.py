@@ -35,8 +35,7 @@ from omnid.core.control.arming import ArmRequest, ContactState, TimedSetpoint
 from omnid.core.control.collision_monitor import ControllerScan
 from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
+from omnid.simulation.rendering.ray_caster import Floats, MountedSensor, Sensor, render_grey
 from omnid.simulation.world import Walkers, World, clearance_m
 
 CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.

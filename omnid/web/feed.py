@@ -29,11 +29,11 @@ from omnid.monitor.teleop import PERIOD_S
 from omnid.plain_text import plain
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
 from omnid.transport.session import BusConfig
-from omnid.transport.status_names import CALIBRATION, MAP_FILE, PLACES, WHEELS, Key, short_name
+from omnid.transport.status_names import CALIBRATION, MAP_FILE, PLACES, TIMEOUT_S, WHEELS, Key, short_name
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
-OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
+OLDEST_S: Final = TIMEOUT_S  # age of the newest state that a page may have when it asks for a motion
 NAVIGATION: Final = "navigation"
 FRAMES: Final = ("odom", "map")  # Frames of a map that is drawn.
 # Topics whose newest message alone counts.

@@ -40,7 +40,7 @@ from omnid.cli import main as omnid_main
 from omnid.core.rig.rig_health import RigState
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.ray_caster import MountedSensor, Sensor
 from tests.bench.results import ResultTable, columns, run
 from tests.simulation import corridor, paths
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig

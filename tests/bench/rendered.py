@@ -35,7 +35,7 @@ from calib.rig_file import read_rig
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.rendering.sensor import Sensor
+from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.tracking_state import TrackingState
 from tests.bench.accuracy import position_errors, squared_errors
 from tests.bench.results import Cell, ResultTable, columns, run

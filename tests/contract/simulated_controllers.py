@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from drivers.motor import VelocityCommand
-from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import BUMPER, CLIFF, SEQ_COUNT, decode, encode
-from drivers.motors.protocols.motor_protocol import Framer, T, TextFramer, Transaction
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, Framer, T, TextFramer, Transaction
 from drivers.motors.protocols.odrive_ascii import CLOSED_LOOP, WATCHDOG_EXPIRED, with_checksum
 from drivers.motors.protocols.roboteq import MAX_RPM
 from drivers.motors.protocols.vesc import (

@@ -15,8 +15,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
-from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import Framer, MotorProtocol, NoReplyError
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, Framer, MotorProtocol, NoReplyError
 from drivers.motors.serial_motor import PROTOCOLS, LateReplyError, SerialMotor
 from tests.contract.simulated_controllers import (
     BASE,

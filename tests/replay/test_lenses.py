@@ -18,7 +18,7 @@ from calib.models.lens import EquidistantCamera
 from calib.rig import MountedCamera
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.ray_caster import MountedSensor, Sensor
 from tests.omnid.stages.test_obstacles import scans_of
 from tests.replay.command import Command
 from tests.simulation import build, corridor, paths, render_grey, tum, write_log

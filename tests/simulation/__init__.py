@@ -1,7 +1,6 @@
 """Rendered worlds with exact ground truth: scenes, rigs, paths, and logs of a robot in them."""
 
-from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.ray_caster import MountedSensor, Sensor, render_grey
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, box, posters
 from tests.simulation.builders import corridor, room, wall
 from tests.simulation.logs import render, tum, write_log

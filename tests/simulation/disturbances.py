@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from calib.models.camera import Array, Mask
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import Floats
+from omnid.simulation.rendering.ray_caster import Floats, render_grey
 from omnid.simulation.rendering.surfaces import POSTER_GAP_M, Rectangle, Scene, Texture
 
 REFRACTIVE_INDEX: Final = 1.5  # of glass, glazed tiles, polish and lacquer

@@ -18,7 +18,7 @@ from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
 from omnid.simulation import lockstep
 from omnid.simulation.lockstep import Drive, SimulatedRun
-from omnid.simulation.rendering.sensor import Floats
+from omnid.simulation.rendering.ray_caster import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedCameras, SimulatedRobot, Vehicle
 from omnid.simulation.world import Walkers, World

@@ -21,7 +21,7 @@ import numpy as np
 from calib.models.camera import Array
 from drivers.motors.simulated_motor import Pose
 from omnid.errors import OmnidError
-from omnid.simulation.rendering.sensor import Sensor
+from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.simulation.rendering.surfaces import Point, Rectangle
 from omnid.simulation.robot import SimulatedRobot, make_robot
 from omnid.simulation.world import Person

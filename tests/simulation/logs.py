@@ -16,8 +16,7 @@ from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
+from omnid.simulation.rendering.ray_caster import Floats, MountedSensor, Sensor, render_grey
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation.disturbances import Disturbance, DisturbedCamera
 from tests.simulation.rigs import MirrorCamera, nominal_rig

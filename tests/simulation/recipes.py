@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.models.camera import Array
 from calib.rig import Rig
-from omnid.simulation.rendering.sensor import Sensor
+from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation import paths
 from tests.simulation.builders import KEPT, bricks, corridor, ring, room, symmetric_room, twin_corridor, two_laps_path

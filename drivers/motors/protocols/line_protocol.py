@@ -41,8 +41,7 @@ from typing import Final
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, TextFramer, Transaction, require_watchdog
 
 SEQ_COUNT: Final = 65536
 _LINE: Final = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")

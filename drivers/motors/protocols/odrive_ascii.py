@@ -24,8 +24,7 @@ from collections.abc import Sequence
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, TextFramer, Transaction, require_watchdog
 
 WATCHDOG_EXPIRED = 0x800  # AXIS_ERROR_WATCHDOG_TIMER_EXPIRED (firmware 0.5, odrive-interface.yaml)
 CLOSED_LOOP = 8  # AXIS_STATE_CLOSED_LOOP_CONTROL

@@ -20,8 +20,7 @@ from collections.abc import Sequence
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, TextFramer, Transaction, require_watchdog
 
 MAX_RPM = 65535
 

@@ -22,8 +22,7 @@ from collections.abc import Callable
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import T, Transaction
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, T, Transaction
 
 SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50  # COMM_PACKET_ID in datatypes.h
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status

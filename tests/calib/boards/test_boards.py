@@ -17,7 +17,7 @@ from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.sensor import Sensor
+from omnid.simulation.rendering.ray_caster import Sensor
 from tests.simulation.boards import (
     SQUARE_PX,
     BoardRenderer,

@@ -13,9 +13,8 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors import serial_motor
-from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol, crc16, decode
-from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, MotorProtocol, T, Transaction
 from drivers.motors.protocols.odrive_ascii import ODriveAscii, with_checksum
 from drivers.motors.protocols.roboteq import Roboteq
 from drivers.motors.protocols.vesc import MASK, MAX_ERPM, Vesc, packet

@@ -17,9 +17,8 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol, encode
-from drivers.motors.protocols.motor_protocol import NoReplyError
+from drivers.motors.protocols.motor_protocol import DifferentialDrive, NoReplyError
 from drivers.motors.serial_motor import SerialMotor
 from tests.contract.simulated_controllers import PtyMotor, SimulatedLine, run, until
 

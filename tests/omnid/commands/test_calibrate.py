@@ -21,7 +21,7 @@ from omnid import replay
 from omnid.cli import main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.rendering.sensor import Sensor
+from omnid.simulation.rendering.ray_caster import Sensor
 from tests.calib.test_importers import BOTH, NAMED, T_UPPER_LOWER, chain
 from tests.calib.test_importers import TEXT as OCAM
 from tests.omnid.transport.bus_fixtures import free_endpoint

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
-from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import DifferentialDrive
 from omnid.controller.controller import Controller
 from omnid.controller.link import ControllerStatistics
 from omnid.core.control.arming import AUTOMATIC, OPERATOR, ArmRequest, TimedSetpoint

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
-from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import DifferentialDrive
 from drivers.motors.serial_motor import LateReplyError
 from drivers.motors.simulated_motor import MotionLimits, SimulatedBase
 from omnid.controller.controller import Controller

@@ -12,7 +12,7 @@ import pytest
 
 from calib.rig_file import read_rig, write_rig
 from drivers.cameras.v4l2_device import CaptureDevice, V4l2Settings
-from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import DifferentialDrive
 from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.controller.motor import MotorSettings
