@@ -102,7 +102,7 @@ def evaluate_run(args: argparse.Namespace) -> int:
 
     estimate EST           t x y z qx qy qz qw, T_odom_rig
     truth TRUTH            the same format, of the same rig frame in any world frame
-    --tolerance-ms MS=10   largest difference between the stamps of two poses
+    --tolerance-ms MS=10 0..  largest difference between the stamps of two poses
     --align origin|rigid=origin  the first pose, as evo's --align_origin; rigid: all positions, as its --align
     --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit three angles by which its axes are turned, and
         print them
@@ -148,7 +148,7 @@ def view(args: argparse.Namespace) -> int:
         if args.log is None:
             _draw_robot(sink, config, math.inf if args.seconds is None else args.seconds)
         else:
-            _draw_recording(sink, args.log, args.topic, args.robot)
+            _draw_recording(sink, args.log, args.topic)
     if sink.poses:
         print(f"{sink.poses} poses and {sink.images} images shown", flush=True)
     return int(not sink.poses)
@@ -198,9 +198,9 @@ def _viewer() -> str:
     return f"rerun+http://127.0.0.1:{port}/proxy"
 
 
-def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | None) -> None:
+def _draw_recording(sink: RerunSink, log: Path, topic: str | None) -> None:
     """Draw what is recorded. Raise OmnidError where there is no pose in it."""
-    with closing(RecordingReader(log, topic, robot)) as reader:
+    with closing(RecordingReader(log, topic)) as reader:
         for message in reader.messages((ODOMETRY, STATUS, CLOUD, SCAN, reader.image_name())):
             with suppress(FrameDecodeError):
                 sink.draw(message.content)

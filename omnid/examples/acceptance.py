@@ -45,17 +45,11 @@ def rests(stamps_s: Array, T: Array) -> list[int]:
 
 
 def visits(xyz: Array, rests: list[int], distance_m: float) -> list[int]:
-    """Return the poses on A, B, A, ...: of several rests on one mark the last one of the first A, else the first."""
-    found: list[int] = []
-    for pose in rests:
-        from_a_m = math.dist(xyz[pose], xyz[rests[0]])
-        if min(from_a_m, abs(from_a_m - distance_m)) > 0.2 * distance_m:
-            continue  # a pause on the way
-        is_a = from_a_m < distance_m / 2
-        if is_a != bool(len(found) % 2):  # the mark that is due
+    """Return the poses on A, B, A, ...: the first rest, and those that are about the distance away from the last."""
+    found = rests[:1]
+    for pose in rests[1:]:
+        if math.dist(xyz[pose], xyz[found[-1]]) > 0.8 * distance_m:  # else a pause, or the same mark
             found.append(pose)
-        elif len(found) == 1:
-            found = [pose]
     return found
 
 

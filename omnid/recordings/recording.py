@@ -52,26 +52,24 @@ class RecordedMessage(NamedTuple):
 class RecordingReader:
     """Reads the messages of one robot of a log: the one whose poses are on a topic of nav_msgs/msg/Odometry.
 
-    log: closed by close(). topic: of the poses; robot: its name, the topic without its last part, or all of it where it
-    has only one. unreadable: messages left out, by topic: not of their type, or not finite; complete once all messages
-    are read.
+    log: closed by close(). topic: of the poses; robot: its name. unreadable: messages left out, by topic: not of their type, or not
+    finite; complete once all messages are read.
     """
 
-    def __init__(self, path: Path, topic: str | None = None, robot: str | None = None) -> None:
-        """topic: of the poses, such as /omnid/odom; robot: stands for /<robot>/odom.
+    def __init__(self, path: Path, topic: str | None = None) -> None:
+        """topic: of the poses, such as /omnid/odom.
 
-        Without both, it is the only topic of its type, else the only `.../odom`. Raise DriverError without a log,
+        Without, it is the only topic of its type, else the only `.../odom`. Raise DriverError without a log,
         OmnidError where there is no such topic, or several and none is named.
         """
         self.log, self.unreadable = open_log(path), Counter[str]()
         counts, topics = self.log.counts(), self.log.topics
         known = [name for name, schema in sorted(topics.items()) if schema == ODOMETRY_SCHEMA and counts[name]]
-        named = topic or (f"/{robot.strip('/')}/{ODOMETRY}" if robot else None)
-        found = [name for name in known if named in (None, name)]
+        found = [name for name in known if topic in (None, name)]
         if len(found) > 1:
             found = [name for name in found if name.endswith(f"/{ODOMETRY}")]
         if len(found) != 1:
-            wrong = f"no {ODOMETRY_SCHEMA} on {named!r}" if named else f"{len(known)} topics of {ODOMETRY_SCHEMA}"
+            wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}" if topic else f"{len(known)} topics of {ODOMETRY_SCHEMA}"
             raise OmnidError(
                 f"{path}: {wrong}: found {listed(known or topics, 'none')}; name one by --topic, or make a recording "
                 f"by `omnid replay {path} --record out.mcap`"
