@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,13 +53,13 @@ class Metrics:
         return "\n".join(f"{name:<21} {value}" for name, value in rows)
 
 
-def evaluate(
-    estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01, alignment: Literal["origin", "rigid"] = "origin"
-) -> Metrics:
+def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01, alignment: str = "origin") -> Metrics:
     """Compare an estimate with the truth, both T_world_rig of the same rig frame in any two worlds.
 
     alignment: "origin" or "rigid", see `aligned`. Raise OmnidError for fewer than two associated poses.
     """
+    if alignment not in ("origin", "rigid"):
+        raise OmnidError(f"an alignment origin or rigid was expected, {alignment!r} found")
     T_est, T_true = same_times(estimate, truth, tolerance_s)
     T_est = aligned(T_est, T_true, alignment)
     (_, est_xyz), (_, true_xyz) = parts(T_est), parts(T_true)
@@ -92,6 +91,8 @@ def same_times(estimate: Trajectory, truth: Trajectory, tolerance_s: float) -> t
     Each estimate is associated with the truth nearest in time within the tolerance; of two estimates with the same
     truth, the nearer one. Raise OmnidError for fewer than two.
     """
+    if not 0.0 <= tolerance_s < math.inf:
+        raise OmnidError(f"a tolerance of 0 s or more was expected, {tolerance_s} found")
     of_estimate, of_truth = associate(estimate.stamps_ns, truth.stamps_ns, round(tolerance_s * 1e9))
     if of_estimate.size < 2:
         raise OmnidError(
@@ -148,7 +149,7 @@ def rotation_between(a: Array, b: Array) -> tuple[Array, Array]:
     return np.asarray(U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt), spread
 
 
-def aligned(T_est: Array, T_true: Array, alignment: Literal["origin", "rigid"]) -> Array:
+def aligned(T_est: Array, T_true: Array, alignment: str) -> Array:
     """Return the estimates (N, 4, 4) in the world of the truth, row by row at the same times.
 
     alignment: "origin": the first poses agree; "rigid": the positions agree best (least squares). Raise OmnidError for

@@ -52,8 +52,8 @@ class RecordedMessage(NamedTuple):
 class RecordingReader:
     """Reads the messages of one robot of a log: the one whose poses are on a topic of nav_msgs/msg/Odometry.
 
-    log: closed by close(). topic: of the poses; robot: its name. unreadable: messages left out, by topic: not of their type, or not
-    finite; complete once all messages are read.
+    log: closed by close(). topic: of the poses; robot: its name. unreadable: messages left out, by topic: not of their
+    type, or not finite; complete once all messages are read.
     """
 
     def __init__(self, path: Path, topic: str | None = None) -> None:

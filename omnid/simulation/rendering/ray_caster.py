@@ -266,7 +266,7 @@ def _pyramid(texture: Texture) -> list[Texture]:
     return levels
 
 
-Floats = NDArray[np.float32]
+# 4. The errors of a sensor.
 # Grey level of struts and hub.
 FITTING_GREY = 18.0
 # Samples per pixel and axis of a strut's edge.

@@ -83,6 +83,11 @@ def test_known_errors() -> None:
 
 def test_refusals_say_what_was_found() -> None:
     truth = straight(5, 0.1)
+    for tolerance_s in (-0.1, math.nan, math.inf):
+        with pytest.raises(OmnidError, match="tolerance"):
+            evaluate(truth, truth, tolerance_s)
+    with pytest.raises(OmnidError, match=r"an alignment origin or rigid .* 'sim3'"):
+        evaluate(truth, truth, alignment="sim3")
     late = trajectory(truth.stamps_ns + 10**12, truth.T)
     with pytest.raises(OmnidError, match=r"0 found: estimate spans 1000.000 to 1000.400 s, truth spans 0.000 to 0.400"):
         evaluate(late, truth)
