@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from drivers.errors import FrameDecodeError
 from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES, image_folders
-from drivers.logs.log_reader import BY_NAME, LogCameras, LogReader
-from drivers.logs.open_log import is_log_name
+from drivers.logs.log_reader import BY_NAME, LogCameras, LogReader, is_log_name
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]

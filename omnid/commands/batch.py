@@ -144,7 +144,7 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
 def _below(path: Path) -> Iterator[Path]:
     """Yield a file; a folder with the parts of one log or with folders of images; or the logs below a folder."""
     from drivers.logs.image_folder import image_folders
-    from drivers.logs.open_log import logs_in, parts_in_order
+    from drivers.logs.log_reader import logs_in, parts_in_order
 
     if not path.is_dir():
         yield path

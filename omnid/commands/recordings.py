@@ -21,7 +21,7 @@ from calib import se3
 from calib.atomic_file import write_file
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.logs.log import Log
-from drivers.logs.open_log import open_log
+from drivers.logs.log_reader import open_log
 from omnid.client import Robot
 from omnid.commands import options
 from omnid.config import Config

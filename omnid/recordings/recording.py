@@ -15,7 +15,7 @@ from typing import Final, NamedTuple, TypeAlias
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame
 from drivers.logs.log import listed
-from drivers.logs.open_log import open_log
+from drivers.logs.log_reader import open_log
 from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.errors import OmnidError
 from omnid.transport.codec import (

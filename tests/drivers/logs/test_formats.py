@@ -23,9 +23,8 @@ from mcap.writer import CompressionType
 from drivers.errors import DriverError, RecordError
 from drivers.frame import Frame
 from drivers.logs.log import unpack_message
-from drivers.logs.log_reader import LogCameras, LogReader, MotionTopics
+from drivers.logs.log_reader import LogCameras, LogReader, MotionTopics, logs_in, open_log
 from drivers.logs.mcap_file import MAGIC
-from drivers.logs.open_log import logs_in, open_log
 from drivers.motion import GyroSample
 from tests.drivers.logs.mcap_logs import (
     BARE,

@@ -18,9 +18,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from rosbags.highlevel import AnyReader
 
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import LogReader, open_log
 from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotationSettings, is_locked
-from drivers.logs.open_log import open_log
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, Entry, pairs, text
 
 ROOT = Path(__file__).parents[3]
