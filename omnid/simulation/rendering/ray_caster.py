@@ -8,10 +8,10 @@ shutter every row has a pose of its own.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ from omnid.simulation.rendering.ray_caster_kernels import cast
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 Floats = NDArray[np.float32]
+T = TypeVar("T")
 TILE_PX = 32  # samples along a tile's side
 KEPT = 6  # Number of cameras whose rays are kept, and of scenes whose textures are.
 # Rounding of float32 rays: of angles [rad] near the axis of a cone, and as a share of distances.
@@ -62,12 +63,17 @@ def cached_rays(mounted: MountedCamera, supersample: int) -> RayTable:
     """Return the camera's table, made once for equal cameras and masks."""
     mask = mounted.visible
     key = mounted.camera, mask.center, mask.inner_px, mask.outer_px, id(mask.image), supersample
-    if key not in _kept:
-        made = mask, ray_table(mounted.camera, mask, supersample)
-        for oldest in list(_kept)[: len(_kept) - KEPT + 1]:
-            del _kept[oldest]
-        _kept[key] = made
-    return _kept[key][1]
+    return _remembered(_kept, key, lambda: (mask, ray_table(mounted.camera, mask, supersample)))[1]
+
+
+def _remembered(kept: dict[Hashable, T], key: Hashable, make: Callable[[], T]) -> T:
+    """Return what is kept by a key, made at first use; KEPT are kept."""
+    if key not in kept:
+        made = make()
+        for oldest in list(kept)[: len(kept) - KEPT + 1]:
+            del kept[oldest]
+        kept[key] = made
+    return kept[key]
 
 
 def ray_table(camera: OmniCamera, mask: Mask, supersample: int) -> RayTable:
@@ -233,12 +239,7 @@ _atlases: dict[Hashable, Atlas] = {}  # by the ids of the textures
 
 def cached_atlas(textures: Sequence[Texture]) -> Atlas:
     """Return the atlas of textures, made once for a scene."""
-    key = tuple(map(id, textures))
-    if key not in _atlases:
-        for oldest in list(_atlases)[: len(_atlases) - KEPT + 1]:
-            del _atlases[oldest]
-        _atlases[key] = _make_atlas(textures)
-    return _atlases[key]
+    return _remembered(_atlases, tuple(map(id, textures)), lambda: _make_atlas(textures))
 
 
 def _make_atlas(textures: Sequence[Texture]) -> Atlas:
