@@ -10,7 +10,6 @@ raise OmnidError for those that are no such message. Encoders raise it for a sta
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -184,7 +183,6 @@ class Pose:
     velocity: Array  # (6,) m/s, rad/s in the base's axes
     velocity_covariance: Array  # (6, 6)
     attachment: PoseAttachment = field(default_factory=PoseAttachment)  # state, sequence number, landmarks
-    received_ns: int = 0  # of Unix time, by the receiver's clock
     frames: Frames = ("odom", "base_link")  # parent, child
 
     @property
@@ -222,11 +220,8 @@ def odometry_cdr(
     return encoded(ODOMETRY_SCHEMA, (stamp_ns, "odom"), "base_link", pose, twist)
 
 
-def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None = None) -> Pose:
-    """Decode an Odometry with a finite, rigid pose and a valid stamp, and its attachment.
-
-    received_ns: time of arrival, of Unix time; default: now.
-    """
+def decode_pose(payload: bytes, attachment: bytes = b"") -> Pose:
+    """Decode an Odometry with a finite, rigid pose and a valid stamp, and its attachment."""
     message = decoded(payload, ODOMETRY_SCHEMA)
     stamp, twist = message.header.stamp, message.twist.twist
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
@@ -238,7 +233,6 @@ def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None
         velocity=np.array([getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]),
         velocity_covariance=message.twist.covariance.reshape(6, 6),
         attachment=PoseAttachment.from_bytes(attachment) if attachment else PoseAttachment(),
-        received_ns=time.time_ns() if received_ns is None else received_ns,
         frames=(message.header.frame_id, message.child_frame_id),
     )
 
