@@ -32,7 +32,7 @@ from omnid.plain_text import one_line, plain
 from omnid.version import __version__
 
 RESULT_FILE = "result.json"
-DONE = {0: "ok", 1: "no pose, or images lost"}  # by the exit code of `omnid replay`
+DONE = dict(enumerate(("ok", "no pose, or images lost")))  # by the exit code of `omnid replay`
 OUTPUTS = ["--tum=est.txt", "--map-tum=map_est.txt", "--cloud=cloud.ply", "--plan=plan.png"]
 # One thread for each program: as many programs run as there are cores.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}

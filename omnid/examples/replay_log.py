@@ -10,7 +10,6 @@ _, log, *rig = sys.argv
 result = omnid.replay(log, rig=next(iter(rig), None))
 for warning in result.warnings:
     print("warning:", warning, file=sys.stderr)
-x_m, y_m, _ = result.T_odom_rig[-1, :3, 3]
-print(f"{len(result.stamps_ns)} poses, {result.counters.length_m:.2f} m, the end is at ({x_m:.2f}, {y_m:.2f}) m")
+print(f"{len(result.stamps_ns)} poses, {result.counters.length_m:.2f} m")
 result.save_tum("trajectory.tum")
 result.save_ply("map.ply")
