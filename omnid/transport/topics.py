@@ -23,15 +23,11 @@ PANORAMA: Final = "panorama"
 CLOCK: Final = "/clock"  # Time of runs whose clock is not the computer's.
 
 
-def _not_read(payload: bytes, attachment: bytes = b"") -> None:
-    """Return no content, for topics that no program of omnid reads."""
-
-
 class Topic(NamedTuple):
     """A published topic and how it is delivered."""
 
     schema: str  # ROS 2 message type
-    decode: Callable[..., Any] = _not_read  # takes payload and attachment; of those that programs of omnid read
+    decode: Callable[..., Any] = lambda *_: None  # takes payload and attachment; None: no program of omnid reads it
     realtime: bool = False  # sent before messages of all other topics
     latched: bool = False  # late subscribers can query the newest message
     transient_local: bool = False  # ... and those of ROS 2 receive it
