@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from functools import reduce
 from os import PathLike
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 from calib.typed_toml import (
     Path,
@@ -23,10 +23,10 @@ from calib.typed_toml import (
     toml_value,
     types_of,
 )
+from calib.validation import MAX_FILE_BYTES
 from omnid.errors import OmnidError
 
 T = TypeVar("T")
-_MAX_BYTES: Final = 1 << 20
 
 
 def load(root: type[T], path: str | PathLike[str] | None = None, overrides: Sequence[str] = ()) -> T:
@@ -37,7 +37,7 @@ def load(root: type[T], path: str | PathLike[str] | None = None, overrides: Sequ
     if path is None:
         return parse(root, b"", origin="defaults", overrides=overrides)
     try:
-        data = bytes_of(path, _MAX_BYTES)
+        data = bytes_of(path, MAX_FILE_BYTES)
     except ValueError as error:
         raise OmnidError(f"the settings file {str(path)!r} {error}") from None
     return parse(root, data, origin=str(path), overrides=overrides)

@@ -136,7 +136,7 @@ def replay(args: argparse.Namespace) -> int:
     --map-tum FILE        trajectory in the map, T_map_rig: places that are recognised correct all poses before them
     --cloud FILE.ply      the map's points with confidence and age
     --plan FILE.png       the map from above with the path
-    --record FILE.mcap    poses, transforms, commands, states and map
+    --record FILE.mcap    poses, transforms, states and map
     --rerun FILE.rrd      path, images with features, depth and plots for the viewer Rerun; not beside --record
     --publish             publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon
         publishes there

@@ -30,7 +30,7 @@ PERIOD_S: Final = 0.05  # Period of the commands.
 # Time for which a key counts as pressed: longer than the pause before a terminal repeats it. Zero is sent as long after
 # a motion; then nothing, so that others may drive.
 HOLD_S: Final = 0.6
-_SIDES: Final = {b"A": (0, 1), b"B": (0, -1), b"D": (1, 1), b"C": (1, -1)}  # axis of the stick, and its side
+_SIDES: Final = {b"A": "forward", b"B": "back", b"D": "left", b"C": "right"}
 # A terminal sends ESC [ A or, in its application mode, ESC O A.
 ARROWS: Final = {begin + letter: side for letter, side in _SIDES.items() for begin in (b"\x1b[", b"\x1bO")}
 # One key: a whole escape sequence (ECMA-48, 5.4, without intermediate bytes, of which the space is one), or a byte.
@@ -39,21 +39,21 @@ _KEY: Final = re.compile(rb"\x1b(?:\[[0-?]{0,16}|O)[@-~]|.", re.DOTALL)
 
 @dataclass
 class Stick:
-    """Keys as a stick: each axis is held for HOLD_S after its last key."""
+    """Keys as a stick: each side is held for HOLD_S after its last key."""
 
     limits: VelocityLimits
     share: float = 0.4  # of the highest speeds, at the start
     stop_asked: bool = False
     arm_asked: bool = False
     quit: bool = False
-    _axes: list[tuple[int, float]] = field(default_factory=lambda: [(0, -math.inf), (0, -math.inf)])
+    _pressed_s: dict[str, float] = field(default_factory=dict)  # by side
+    _moved_s: float = -math.inf  # when the last arrow was pressed
 
     def press(self, data: bytes, now_s: float) -> None:
         """Take the bytes of the keys pressed until now_s."""
         for key in _KEY.findall(data):
             if key in ARROWS:
-                axis, side = ARROWS[key]
-                self._axes[axis] = side, now_s
+                self._pressed_s[ARROWS[key]] = self._moved_s = now_s
             elif key in (b"+", b"=", b"-"):
                 self.share = self.share / 2 if key == b"-" else min(1.0, 2 * self.share)
             elif key == b"a":  # not A, with which a key ends whose bytes come in parts
@@ -62,16 +62,17 @@ class Stick:
                 self.quit = True
             else:  # space, and any key that means nothing: in doubt the wheels stop
                 self.stop_asked |= key == b" "
-                self._axes = [(0, pressed_s) for _, pressed_s in self._axes]
+                self._pressed_s.clear()
 
     def twist(self, now_s: float) -> tuple[float, float]:
         """Return forward speed [m/s] and yaw rate [rad/s]."""
-        forward, turn = (side if now_s - pressed_s <= HOLD_S else 0 for side, pressed_s in self._axes)
+        held = {side for side, pressed_s in self._pressed_s.items() if now_s - pressed_s <= HOLD_S}
+        forward, turn = ("forward" in held) - ("back" in held), ("left" in held) - ("right" in held)
         return (self.share * forward * self.limits.velocity_mps, self.share * turn * self.limits.yaw_rate_radps)
 
     def commands(self, now_s: float) -> bool:
         """Return True if there is a motion, or was one until a moment ago."""
-        return any(now_s - pressed_s <= 2 * HOLD_S for _, pressed_s in self._axes)
+        return now_s - self._moved_s <= 2 * HOLD_S
 
 
 def teleoperate(bus: BusConfig) -> int:

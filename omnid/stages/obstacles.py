@@ -73,10 +73,6 @@ UNKNOWN: Final = np.full(SECTORS, np.nan, np.float32)
 NOT_FREE: Final = np.zeros(SECTORS, np.float32)
 
 
-# A direction of the cameras is one of the base only far away, because the viewpoint may lie off the base's origin.
-UNWATCHED_M: Final = (0.3, 0.6, 1.2, 2.5, 5.0, math.inf)
-
-
 def sectors_of(tiles: Flags, cylinder: Cylinder, T_base_rect: Array, ranges_m: Sequence[float]) -> Flags:
     """Return the sectors (SECTORS,) about the base that columns of tiles (C,) show at ranges [m].
 
@@ -105,6 +101,8 @@ class Obstacles:
         self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, config.scan)
         self._tracker = MovingTracker()
         self._T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
+        # A direction of the cameras is one of the base only far away, because the viewpoint may lie off its origin.
+        self._ranges_m = (*(config.scan.max_range_m / 2**k for k in range(6)), math.inf)
         self._last_ns: int | None = None
         self._resets = 0
 
@@ -134,7 +132,7 @@ class Obstacles:
         panoramas = odometry.depth.panoramas
         T_odom_base = frames.of_base(odometry, self._geometry.rig.T_base_rig)[0]
         tiles, of_base = panoramas.tiles, (self._geometry.cylinder, self._T_base_rect)
-        unwatched = sectors_of(tiles.unknown, *of_base, UNWATCHED_M)
+        unwatched = sectors_of(tiles.unknown, *of_base, self._ranges_m)
         unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         # 2. Tables of the floor.
         floor = self.floor.floor

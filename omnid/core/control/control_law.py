@@ -1,7 +1,6 @@
 """The one control law: from the newest pose and the newest setpoint to a motion within all limits.
 
-It reads no clock: time is an argument. The controller process steps it on CLOCK_MONOTONIC, a replay on the stamps of
-its log (omnid.sinks.drive).
+It reads no clock: time is an argument. The controller process steps it on CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import keyframe_ranges
-from omnid.stages.obstacles import UNWATCHED_M, CameraFloor, Obstacles, sectors_of
+from omnid.stages.obstacles import CameraFloor, Obstacles, sectors_of
 from omnid.tracking_state import TrackingState
 from tests.omnid.core import test_floor
 from tests.omnid.core.obstacles.drawn_floor import (
@@ -37,6 +37,8 @@ from tests.omnid.core.obstacles.drawn_floor import (
 )
 from tests.omnid.core.test_floor import plane, walls
 from tests.simulation.rigs import make_rig
+
+RANGES_M = (0.3, 0.6, 1.2, 2.5, 5.0, math.inf)
 
 
 class Scans:
@@ -164,16 +166,16 @@ DEAD[27:33] = True  # 36 degrees about azimuth 0, which is in the middle of the 
 
 def test_columns_of_tiles_are_sectors_about_the_same_azimuth() -> None:
     """The middle of the panorama is ahead, and azimuth falls from left to right."""
-    found = np.flatnonzero(sectors_of(DEAD, CYLINDER, np.eye(4), UNWATCHED_M))
+    found = np.flatnonzero(sectors_of(DEAD, CYLINDER, np.eye(4), RANGES_M))
     assert found.min() in (161, 162) and found.max() in (197, 198) and len(found) <= 38
     left = np.zeros(TILE_COLUMNS, bool)
     left[14] = True
-    assert (np.flatnonzero(sectors_of(left, CYLINDER, np.eye(4), UNWATCHED_M)) - 180 > 80).all()
+    assert (np.flatnonzero(sectors_of(left, CYLINDER, np.eye(4), RANGES_M)) - 180 > 80).all()
 
 
 def test_tiles_of_a_viewpoint_beside_the_origin_cover_near_and_far_directions() -> None:
     """Cameras 0.3 m to the left: what is ahead of them is to the left of the base where it is near."""
-    found = sectors_of(DEAD, CYLINDER, se3.transform(np.eye(3), [0.0, 0.3, 0.9]), UNWATCHED_M)
+    found = sectors_of(DEAD, CYLINDER, se3.transform(np.eye(3), [0.0, 0.3, 0.9]), RANGES_M)
     for range_m in (0.6, 1.2, 4.0):
         azimuth = math.atan2(0.3, range_m)
         assert found[math.floor((azimuth + math.pi) * SECTORS / math.tau)], range_m
