@@ -11,7 +11,6 @@ from typing import Final
 
 MOST_CHARACTERS: Final = 400
 MOST_ENTRIES: Final = 64  # of parts in a status, and of values in a part
-UNIX_TIMES_S: Final = (10**9, 2**33)  # 2001 to 2242; the clock of a simulation or of a camera is outside
 
 
 def plain(text: str, most: int = MOST_CHARACTERS) -> str:
@@ -30,9 +29,6 @@ def _shown(letter: str) -> str:
 
 
 def utc(stamp_ns: int) -> str:
-    """Return date and time of a stamp (ns) to the millisecond, in ISO 8601; seconds where it is no Unix time."""
+    """Return date and time of a stamp (ns), before the year 10000, to the millisecond in ISO 8601."""
     seconds, rest_ns = divmod(stamp_ns, 10**9)
-    rest = f"{rest_ns // 10**6:03}"
-    if not UNIX_TIMES_S[0] <= seconds < UNIX_TIMES_S[1]:
-        return f"{seconds}.{rest} s"
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest}Z"
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 10**6:03}Z"

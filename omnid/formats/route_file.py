@@ -38,7 +38,7 @@ class _Content(Struct, forbid_unknown_fields=True):
     format: Literal["omnid route"]
     version: Literal[1]
     name: str
-    created_s: Annotated[int, Meta(ge=0, lt=1 << 40)]
+    created_s: Annotated[int, Meta(ge=0, lt=1 << 37)]
     map: str
     columns: list[str]
     points: Annotated[list[_Point], Meta(min_length=2, max_length=MOST_POINTS)]
