@@ -10,6 +10,7 @@ import pytest
 from msgspec import Meta
 
 from calib.typed_toml import key_paths
+from calib.validation import MAX_FILE_BYTES
 from omnid.config import FIRST_SETTINGS, Config, load_config, unused_settings
 from omnid.errors import OmnidError
 from omnid.settings import dump, load, parse
@@ -111,7 +112,7 @@ def test_refuses_a_wrong_override(override: str, expected: str) -> None:
 
 
 def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
-    for path in (tmp_path / "missing.toml", tmp_path, Path("a\0b"), written(tmp_path, b"#" * (1 << 20) + b"#")):
+    for path in (tmp_path / "missing.toml", tmp_path, Path("a\0b"), written(tmp_path, b"#" * (MAX_FILE_BYTES + 1))):
         with pytest.raises(OmnidError, match=r"settings file .*(omnid|missing|test_|a\\x00b)"):
             load(Sample, path)
 
