@@ -172,7 +172,7 @@ def _client(scheduler: str | None, jobs: int) -> Any:
     """Return a client of an existing scheduler, or of threads in this process, each of which waits for programs."""
     require("fleet", "distributed")
     distributed = import_module("distributed")
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # each connection and repetition is told
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it reports each connection and repetition
     if not scheduler:
         # dask has web servers in any case, by default for all machines of the network.
         warnings.simplefilter("ignore", RuntimeWarning)  # it looks for this machine's address, also without network

@@ -82,8 +82,8 @@ def goto(args: argparse.Namespace) -> int:
 
     one of:
     --cancel  end what is under way
-    --pause   halt
-    --resume  go on after a halt or a fault; it arms the robot, too
+    --pause   stop until --resume
+    --resume  go on after a pause or a fault; it arms the robot, too
 
     examples:
       goto 3 1.5 90

@@ -103,22 +103,22 @@ def demonstrate(image: Path, config: Config, seed: int, show: Callable[[str], No
         for later in (False, True)
     )
     # 2. The image: the world, and both rounds.
-    segments, nothing = world.obstacles(1.2), np.zeros((0, 2))
-    sheet = sheet_of(nothing, segments.reshape(-1, 2))
+    segments, no_points = world.obstacles(1.2), np.zeros((0, 2))
+    sheet = sheet_of(no_points, segments.reshape(-1, 2))
     parts = (list(segments), [first], [second])
     lines = [Lines(part, colour, width_px) for part, (_, colour, width_px) in zip(parts, LEGEND, strict=True)]
-    drawn = draw_plan(sheet, nothing, np.zeros(0, np.float32), lines)
+    drawn = draw_plan(sheet, no_points, np.zeros(0, np.float32), lines)
     draw_ends(drawn, sheet, first[0])
     if not cv2.imwrite(str(image), with_legend(drawn, LEGEND)):
         raise OmnidError(f"{image}: cannot be written; name another folder by --output")
     # 3. The errors.
     end = script.end or f"not reached within {DRIVE_S:g} s"
     drift_m = np.linalg.norm(se3.apply(se3.inverse(run.truth_in_odom[-1]), run.T_odom_base[-1, :3, 3][None])[0, :2])
-    told = [f"end       {end}, contacts with obstacles: {len(run.contacts)}"]
-    told.append(f"pose      {100 * drift_m:.1f} cm off at the end")
+    report = [f"end       {end}, contacts with obstacles: {len(run.contacts)}"]
+    report.append(f"pose      {100 * drift_m:.1f} cm off at the end")
     if len(second):
         off_cm = 100 * cross_track_m(first, second)
-        told.append(
+        report.append(
             f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), {off_cm.max():.1f} at most"
         )
-    return script.end == NavigationState.REACHED, told
+    return script.end == NavigationState.REACHED, report

@@ -5,7 +5,7 @@
 When was a message sent? One rule (`Freshness`) for all that can begin, resume or release a motion. All times in it are
 the robot's CLOCK_MONOTONIC. A message says when it was sent by
 
-    echo   the robot's own time, as the robot told it to the sender, attached; no clock of anybody else is in it
+    echo   the robot's own time, as the robot sent it to the sender, attached; no other clock is in it
     stamp  Unix time by the sender's clock, in its header or attached; compared with the robot's clocks
 
 and the nearer of the two to its arrival counts. What can begin a motion (arm, a goal, the first setpoint of a stream,

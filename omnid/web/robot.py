@@ -91,7 +91,7 @@ class RobotPage:
             try:
                 stopping = partial(stop, self.feed.bus, connection=self.feed.robot)
                 is_stopped = await asyncio.get_running_loop().run_in_executor(self._stop_thread, stopping)
-                words = "the robot stops: its wheels stand until it is armed" if is_stopped else not_confirmed
+                words = "the robot stops: its wheels stay stopped until it is armed" if is_stopped else not_confirmed
                 answer = Answer(is_stopped, words)
             except OmnidError as error:
                 answer = Answer(False, f"{not_confirmed}. {error}")
@@ -173,7 +173,7 @@ class RobotPage:
         self._sending = asyncio.get_running_loop().run_in_executor(self._stick_thread, send)
         await asyncio.wait([self._sending], timeout=ANSWER_S / 2)  # a robot that does not read is not waited for
         if not moves:
-            return Answer(True, "the stick is released: it stands")
+            return Answer(True, "the stick is released: the robot stops")
         return Answer(True, f"it drives by the stick: {velocity_mps:+.2f} m/s, {math.degrees(rate_radps):+.0f}°/s")
 
 

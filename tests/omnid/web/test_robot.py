@@ -156,7 +156,7 @@ def test_a_stop_ends_once_it_is_confirmed_whoever_asks_for_it(rover: Rover) -> N
         assert not wheels.is_stopping
         return answers
 
-    assert asyncio.run(stops()) == [Answer(True, "the robot stops: its wheels stand until it is armed")] * 3
+    assert asyncio.run(stops()) == [Answer(True, "the robot stops: its wheels stay stopped until it is armed")] * 3
 
 
 def test_the_stick_sends_a_share_of_the_limits(rover: Rover, page: RobotPage, clock_ms: list[int]) -> None:
@@ -178,7 +178,7 @@ def test_the_stick_sends_a_share_of_the_limits(rover: Rover, page: RobotPage, cl
     assert answer(1, 0, "b") == Answer(False, "another page drives")
     # A release counts, however late; another page drives after a while without requests.
     count = len(rover.twists)
-    assert answer(0, 0, late_ms=5000) == Answer(True, "the stick is released: it stands")
+    assert answer(0, 0, late_ms=5000) == Answer(True, "the stick is released: the robot stops")
     wait_until(lambda: len(rover.twists) > count)
     assert rover.twists[count:] == [(0.0, 0.0)]
     page._held_until_s = 0.0
