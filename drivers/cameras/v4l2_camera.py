@@ -155,9 +155,12 @@ class BufferChecks:
     """
 
     def __init__(self, name: str, state: CameraState, timeout_s: float, on_event: EventCallback) -> None:
-        """timeout_s: no driver keeps a buffer for longer; an older stamp is from another clock."""
+        """timeout_s: without an image. A stamp that is older than five of it is from another clock.
+
+        Younger ones wait in the driver while this program is held up: they are right.
+        """
         self._name, self._state, self._on_event = name, state, on_event
-        self._max_age_ns = round(timeout_s * 1e9)
+        self._max_age_ns = round(5e9 * timeout_s)
         self.last_sequence: int | None = None  # None: the first buffer of a stream is awaited
         self._last_ns = -1
         self._least_delay_ns: int | None = None  # from valid stamps to their arrivals
@@ -184,8 +187,9 @@ class BufferChecks:
         """Return the capture time of a buffer [ns of CLOCK_MONOTONIC], strictly increasing from call to call.
 
         arrival_ns: time at which the buffer was taken from the driver, same clock. A stamp is valid if it is later
-        than the one before and at most timeout_s before the arrival; others are replaced by the arrival less the least
-        delay. v4l2loopback does not declare its clock: its stamps are taken for CLOCK_MONOTONIC, with one warning.
+        than the one before and at most five times timeout_s before the arrival; others are replaced by the arrival less
+        the least delay. v4l2loopback does not declare its clock: its stamps are taken for CLOCK_MONOTONIC, with one
+        warning.
         """
         if buffer.flags & BufferFlag.TIMESTAMP_MASK != BufferFlag.TIMESTAMP_MONOTONIC:
             self._report_once("its driver does not declare a clock for its stamps; CLOCK_MONOTONIC is assumed")

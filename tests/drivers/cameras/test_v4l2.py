@@ -340,7 +340,7 @@ class Buffers:
 
     def __init__(self) -> None:
         self.state, self.events = CameraState(), list[tuple[int, str]]()
-        self.checks = BufferChecks("lower camera", self.state, 10.0, lambda *event: self.events.append(event))
+        self.checks = BufferChecks("lower camera", self.state, 2.0, lambda *event: self.events.append(event))
 
     def accepted(self, *buffers: dict[str, int]) -> list[bool]:
         usual = {"flags": BufferFlag.TIMESTAMP_MONOTONIC, "bytesused": MIN_BYTES}
