@@ -8,6 +8,7 @@ diagonal.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -19,8 +20,6 @@ from calib.models.camera import Array
 
 # Inner corners along one side: fewer do not determine a pose well, more are a misread option.
 MIN_SIDE, MAX_SIDE = 3, 60
-# Squares beyond these are refused, because they are lengths in another unit.
-MIN_SQUARE_M, MAX_SQUARE_M = 1e-4, 10.0
 # Half side of the window about a checkerboard's corner [squares], less than a half, so that neighbours share no pixel.
 WINDOW = 0.42
 # Tags as in Kalibr: number of those of the family 36h11, width of the border [bits], bits along a side within it.
@@ -41,8 +40,8 @@ class Board:
                 f"board: expected {MIN_SIDE} to {MAX_SIDE} inner corners a side, found "
                 f"{self.columns}x{self.rows}; count the points where four squares meet, not the squares"
             )
-        if not MIN_SQUARE_M <= self.square_m <= MAX_SQUARE_M:
-            raise CalibError(f"board: expected squares of 0.1 mm to 10 m, found {self.square_m * 1e3:g} mm")
+        if not 0 < self.square_m < math.inf:
+            raise CalibError(f"board: expected squares of a length above 0, found {self.square_m * 1e3:g} mm")
 
     @property
     def points(self) -> Array:
@@ -77,8 +76,8 @@ class AprilGrid:
             raise CalibError(
                 f"board: expected 1 to {TAGS} tags, as the family 36h11 has, found {self.columns}x{self.rows}"
             )
-        if not MIN_SQUARE_M <= self.tag_m <= MAX_SQUARE_M:
-            raise CalibError(f"board: expected tags of 0.1 mm to 10 m, found {self.tag_m * 1e3:g} mm")
+        if not 0 < self.tag_m < math.inf:
+            raise CalibError(f"board: expected tags of a length above 0, found {self.tag_m * 1e3:g} mm")
         if not 0 < self.spacing <= 1:
             raise CalibError(
                 "board: expected a space between tags of at most a tag's side, like Kalibr's tagSpacing, found "

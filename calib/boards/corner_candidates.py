@@ -1,14 +1,9 @@
-"""Corner candidates: points where four squares may meet, found as saddle points of grey with two crossing edges.
-
-They are searched in an image and in those derived from it, in which a board is easier to find.
-"""
+"""Corner candidates: points where four squares may meet, found as saddle points of grey with two crossing edges."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -19,32 +14,18 @@ from calib.boards.board import MAX_SIDE
 from calib.models.camera import Array
 
 Grey = NDArray[np.float32]
-# Samples on the ring about a corner, about one a pixel because the largest one is 29 px around.
+Image = NDArray[np.uint8]
+# Samples on the ring about a corner: two a pixel.
 RING = 32
 # Standard deviation of the Gaussian blur before grey levels of a ring are sampled.
 BLUR_PX = 0.7
-# Least contrast of a ring [grey levels].
-MIN_CONTRAST = 6.0
 # Largest ratio of the ring's odd part to its even part (standard deviations), because opposite sides of a corner have
-# the same grey.
-MAX_ODD = 0.6
-# Least angle between the two edges of a corner.
-MIN_CROSSING_RAD = np.deg2rad(18)
-# Least second derivative at a saddle point [grey levels / px^2].
-MIN_SADDLE = 0.6
+# the same grey, and the edge of what hides a board does not.
+MAX_ODD = 0.4
 
 
-@dataclass(frozen=True, slots=True)
-class ScaleLevel:
-    """A scale of the search: the image resized by scale and blurred; radius of the ring [resized px]."""
-
-    scale: float
-    blur_px: float
-    ring_px: float
-
-
-# Rings of 2.6, 4.6, 8.4 and 16.8 px of the image, each at most twice the last, so that squares of all sizes fit one.
-LEVELS = (ScaleLevel(1.0, 0.8, 2.6), ScaleLevel(1.0, 1.4, 4.6), ScaleLevel(0.5, 1.2, 4.2), ScaleLevel(0.25, 1.2, 4.2))
+# Radius of the ring, and the scales of the image at which it is sampled, so that squares of all sizes fit one.
+RING_PX, SCALES = 2.6, (1.0, 0.5, 0.25)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +49,7 @@ class CornerCandidates:
 
 def find_corners(image: NDArray[np.uint8]) -> CornerCandidates:
     """Find all candidates in an image (H, W) at all scales; of several at one place the best is kept."""
-    levels = [_at_level(image, level) for level in LEVELS]
+    levels = [_at_scale(image, scale) for scale in SCALES]
     parts = [np.concatenate([getattr(level, one.name) for level in levels]) for one in fields(CornerCandidates)]
     found = CornerCandidates(*parts)
     found = found.select(np.argsort(-found.quality * found.contrast, kind="stable"))
@@ -85,8 +66,7 @@ def describe_corners(image: Grey, pixels: Array, ring_px: float | Array) -> Corn
     contrast = np.ptp(even, axis=1)
     ratio = odd.std(axis=1) / np.maximum(even.std(axis=1), 1e-6)
     angles, light, crossings = _edges(even - ((even.max(axis=1) + even.min(axis=1)) / 2)[:, None])
-    between = np.minimum(angles[:, 1] - angles[:, 0], np.pi - (angles[:, 1] - angles[:, 0]))
-    good = (crossings == 2) & (contrast >= MIN_CONTRAST) & (ratio < MAX_ODD) & (between > MIN_CROSSING_RAD)
+    good = (crossings == 2) & (ratio < MAX_ODD)
     return CornerCandidates(pixels, angles, light, contrast, np.where(good, 1 - ratio, 0.0), radius)
 
 
@@ -107,18 +87,12 @@ def smoothed(image: NDArray[np.generic], blur_px: float) -> Grey:
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px), np.float32)
 
 
-def _at_level(image: NDArray[np.uint8], level: ScaleLevel) -> CornerCandidates:
-    """Return the corners of one level, in pixels of the image itself."""
-    shrunk = (
-        image
-        if level.scale == 1
-        else cv2.resize(image, None, fx=level.scale, fy=level.scale, interpolation=cv2.INTER_AREA)
-    )
-    blurred = smoothed(shrunk, level.blur_px)
-    places = _saddles(blurred, int(np.ceil(level.ring_px)))
-    found = describe_corners(blurred, places, level.ring_px)
+def _at_scale(image: NDArray[np.uint8], scale: float) -> CornerCandidates:
+    """Return the corners at one scale, in pixels of the image itself."""
+    blurred = smoothed(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), BLUR_PX)
+    found = describe_corners(blurred, _saddles(blurred, math.ceil(RING_PX)), RING_PX)
     found = found.select(found.quality > 0)
-    return replace(found, pixels=(found.pixels + 0.5) / level.scale - 0.5, ring_px=found.ring_px / level.scale)
+    return replace(found, pixels=(found.pixels + 0.5) / scale - 0.5, ring_px=found.ring_px / scale)
 
 
 def _saddles(blurred: Grey, border: int) -> Array:
@@ -127,7 +101,7 @@ def _saddles(blurred: Grey, border: int) -> Array:
     derivatives = [cv2.Sobel(blurred, cv2.CV_32F, dx, dy, ksize=3, scale=scale) for dx, dy, scale in orders]
     _, _, xx, yy, xy = derivatives
     strength = xy * xy - xx * yy  # the negative determinant of the Hessian
-    peak = (strength == cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > MIN_SADDLE**2)
+    peak = (strength == cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > 0)
     peak[:border], peak[-border:], peak[:, :border], peak[:, -border:] = False, False, False, False
     row, column = np.nonzero(peak)
     # So many that the largest board fits.
@@ -168,66 +142,3 @@ def _suppress_duplicates(pixels: Array, reach: Array) -> NDArray[np.intp]:
         if kept[earlier]:
             kept[later] = False
     return np.flatnonzero(kept)
-
-
-Image = NDArray[np.uint8]
-# Larger images are not enlarged: their boards have enough pixels.
-MAX_ENLARGED_PIXELS = 1_600_000
-# Largest width of one turn of a log-polar strip, and its width in turns, so that boards across its ends are seen whole.
-MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
-# Inner radius of a log-polar strip, as a fraction of the image's smaller side.
-STRIP_INNER_PART = 1 / 16
-
-
-@dataclass(frozen=True, slots=True)
-class DerivedImage:
-    """An image derived from the source image; to_source maps its pixels (N, 2) to source pixels (N, 2)."""
-
-    image: Image
-    to_source: Callable[[Array], Array]
-
-
-def derived_images(image: Image) -> Iterator[DerivedImage]:
-    """Yield the image and its derived images, the cheapest first."""
-    yield DerivedImage(image, lambda pixels: pixels)
-    if image.size <= MAX_ENLARGED_PIXELS:
-        double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8, copy=False)
-        yield DerivedImage(double, lambda pixels: (pixels + 0.5) / 2 - 0.5)
-    yield unrolled(image)
-
-
-def unrolled(image: Image) -> DerivedImage:
-    """Return the log-polar strip about the image's middle: azimuth to the right, logarithm of the radius upwards.
-
-    It is conformal: squares stay square, and boards near the hub become larger and lose their fan shape.
-    """
-    height, width = image.shape
-    strip = cv2.remap(image, *_strip_maps((height, width)), cv2.INTER_CUBIC).astype(np.uint8, copy=False)
-    _, outer, scale = _strip_scale((height, width))
-    middle = np.array([width - 1, height - 1]) / 2
-
-    def to_source(pixels: Array) -> Array:
-        azimuth, radius = pixels[:, 0] / scale, outer * np.exp(-pixels[:, 1] / scale)
-        return np.asarray(middle + radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
-
-    return DerivedImage(strip, to_source)
-
-
-def _strip_scale(shape: tuple[int, int]) -> tuple[float, float, float]:
-    """Return inner and outer radius [px] of a strip, and its pixels per radian; shape: (H, W) of the image."""
-    inner, outer = min(shape) * STRIP_INNER_PART, max(shape) / 2
-    return inner, outer, min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)
-
-
-@lru_cache(maxsize=2)
-def _strip_maps(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the columns and rows (H, W) [px] of the image for each pixel of its strip, for cv2.remap.
-
-    They are kept, because all images of a camera have one shape.
-    """
-    inner, outer, scale = _strip_scale(shape)
-    azimuth = np.arange(int(STRIP_TURNS * 2 * np.pi * scale)) / scale
-    radius = outer * np.exp(-np.arange(int(np.log(outer / inner) * scale)) / scale)
-    u = (shape[1] - 1) / 2 + np.outer(radius, np.cos(azimuth))
-    v = (shape[0] - 1) / 2 + np.outer(radius, np.sin(azimuth))
-    return u.astype(np.float32), v.astype(np.float32)

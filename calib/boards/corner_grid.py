@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib.boards.corner_candidates import CornerCandidates, Grey, describe_corners, sample
-from calib.boards.local_mapping import LocalMapping, local_mapping
+from calib.boards.board import WINDOW
+from calib.boards.corner_candidates import RING_PX, CornerCandidates, Grey, describe_corners, sample
+from calib.boards.local_mapping import LocalMapping, local_mapping, predicted_corners
 from calib.models.camera import Array
 
 Cell = tuple[int, int]
@@ -21,15 +21,6 @@ Key = TypeVar("Key")
 Grid = dict[Cell, Array]
 # To the neighbours along columns and rows: exact.
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
-# Half side of the window about a checkerboard's corner, as a fraction of its square, in which the corner is searched
-# and whose ring describes it: less than a half, otherwise it would reach the next one's.
-WINDOW_PART = 0.3
-# Least distances in which a corner is searched, and radius of its ring: a smaller one has too few pixels, twelve.
-MIN_SEARCH_PX, MIN_RING_PX = 1.5, 2.0
-MIN_SIDE_PX = 1.0  # Least half side of a window; smaller squares are not resolved.
-MIN_WINDOW_PX, MAX_WINDOW_PX = 2, 15  # of cv2.cornerSubPix
-# Its iterations and convergence, as in OpenCV's tutorial of it.
-SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX = 40, 1e-3
 
 
 def find_grids(image: Grey, corners: CornerCandidates) -> list[Grid]:
@@ -93,8 +84,7 @@ def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
         border = {(i + di, j + dj) for i, j in grid for di, dj in STEPS} - set(grid) - refused
         mappings = {cell: local_mapping(np.array(cell, float), at, where) for cell in border}
         known = {cell: mapping for cell, mapping in mappings.items() if mapping is not None}
-        search_px = [max(MIN_SEARCH_PX, WINDOW_PART * mapping.side_px) for mapping in known.values()]
-        found = shown_corners(image, known, WINDOW_PART, search_px) if known else {}
+        found = shown_corners(image, known, WINDOW) if known else {}
         if not found:
             break
         refused |= set(known) - set(found)
@@ -105,25 +95,17 @@ def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
     return grid
 
 
-def shown_corners(
-    image: Grey,
-    predicted: Mapping[Key, LocalMapping],
-    window: float,
-    search_px: Sequence[float],
-    least_quality: float = 0.0,
-) -> dict[Key, Array]:
+def shown_corners(image: Grey, predicted: Mapping[Key, LocalMapping], window: float) -> dict[Key, Array]:
     """Return the predicted corners that the image shows, refined.
 
-    window: half side [squares] of the window about a corner in which grey depends on that corner alone. search_px:
-    largest distance of each from its prediction.
+    window: half side [squares] of the window about a corner in which grey depends on that corner alone.
     """
-    start = np.array([mapping.coefficients[0] for mapping in predicted.values()])
-    sizes = np.array([mapping.side_px for mapping in predicted.values()])
-    refined = refine_subpixel(image, start, window * sizes)
-    seen = describe_corners(image, refined, np.maximum(MIN_RING_PX, window * sizes))
-    near = np.linalg.norm(refined - start, axis=1) < search_px
-    inside = ((start > MIN_RING_PX) & (start < np.array(image.shape[::-1]) - 1 - MIN_RING_PX)).all(axis=1)
-    good = inside & near & (window * sizes > MIN_SIDE_PX) & (seen.quality > least_quality)
+    radius = np.maximum(RING_PX, window * np.array([mapping.side_px for mapping in predicted.values()]))
+    refined, moves = predicted_corners(image, list(predicted.values()), window)
+    seen = describe_corners(image, refined, radius)
+    inside = ((refined > RING_PX) & (refined < np.array(image.shape[::-1]) - 1 - RING_PX)).all(axis=1)
+    is_resolved = np.array([2 * window * mapping.side_px > RING_PX for mapping in predicted.values()])
+    good = inside & (moves > 0) & (moves < window / 2) & is_resolved & (seen.quality > 0)
     return {key: pixel for key, pixel, fine in zip(predicted, refined, good, strict=True) if fine}
 
 
@@ -139,28 +121,11 @@ def with_clockwise_axes(grid: Grid) -> Grid:
     return {(row, column): pixel for (column, row), pixel in grid.items()}
 
 
-def refine_subpixel(image: Grey, pixels: Array, reach: Array) -> Array:
-    """Move pixels (N, 2) to the corner nearby (cv2.cornerSubPix); reach (N,) [px]: half sides of the windows."""
-    refined = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
-    half = np.clip(np.rint(reach), MIN_WINDOW_PX, MAX_WINDOW_PX).astype(int)
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX)
-    height, width = image.shape
-    inside = ((pixels > half[:, None] + 2) & (pixels < np.array([width, height]) - half[:, None] - 3)).all(axis=1)
-    for window in np.unique(half[inside]):
-        mine = np.flatnonzero((half == window) & inside)
-        refined[mine] = cv2.cornerSubPix(image, refined[mine].copy(), (int(window),) * 2, (-1, -1), stop)
-    return np.asarray(refined.reshape(-1, 2), float)
-
-
 Indices = NDArray[np.int64]
 # Number of nearest candidates among which an arm's neighbour is chosen, because a grid has so many within three
 # squares.
 NEAREST = 28
-# Largest angle between an arm and the line to its neighbour, because edges in a mirror image are curved.
-MAX_TURN_RAD = np.deg2rad(22)
-# The edge between two neighbours is sampled on both sides, ASIDE of its length away, at the fractions ALONG of it.
-# Its two sides must differ by MIN_EDGE of the corners' contrast.
-ASIDE, MIN_EDGE = 0.17, 0.3
+# The edge between two neighbours is sampled at these fractions of it, on both sides, the first fraction away.
 ALONG = np.linspace(0.2, 0.8, 5)
 # No index, because the least one is 0.
 NO_NEIGHBOUR = -1
@@ -189,14 +154,13 @@ def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[Indices, In
     angle = np.arctan2(step[:, 1], step[:, 0])
     arm_a, arm_b = _arm_along(corners.angles[a], angle), _arm_along(corners.angles[b], angle + np.pi)
     left_is_light = corners.light[a] ^ (arm_a % 2 == 1)
-    fits = (arm_a >= 0) & (arm_b >= 0) & (left_is_light == ~(corners.light[b] ^ (arm_b % 2 == 1)))
+    fits = left_is_light == ~(corners.light[b] ^ (arm_b % 2 == 1))
     a, b, arm_a, arm_b, step, left_is_light = (one[fits] for one in (a, b, arm_a, arm_b, step, left_is_light))
     # 3. An edge along the line, with light and dark on the same sides as at a's arm.
-    across = ASIDE * np.column_stack([-step[:, 1], step[:, 0]])  # towards larger angles
+    across = ALONG[0] * np.column_stack([-step[:, 1], step[:, 0]])  # towards larger angles
     middle = corners.pixels[a][:, None] + ALONG[:, None] * step[:, None]
     difference = sample(image, middle + across[:, None]) - sample(image, middle - across[:, None])
-    signed = np.where(left_is_light, 1, -1)[:, None] * difference
-    seen = signed.min(axis=1) > MIN_EDGE * np.minimum(corners.contrast[a], corners.contrast[b])
+    seen = (np.where(left_is_light, 1, -1)[:, None] * difference > 0).all(axis=1)
     # 4. The nearest neighbour of each arm, which is written last, where both ends choose each other.
     neighbour[a[seen], arm_a[seen]] = b[seen]
     back[a[seen], arm_a[seen]] = arm_b[seen]
@@ -206,8 +170,6 @@ def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[Indices, In
 
 
 def _arm_along(edges: Array, angle: Array) -> Indices:
-    """Return the arm (M,) of corners with edges (M, 2) [rad] that points along an angle (M,); NO_NEIGHBOUR if none."""
+    """Return the arm (M,) of corners with edges (M, 2) [rad] that is nearest to an angle (M,)."""
     arms = np.concatenate([edges, edges + np.pi], axis=1)
-    off = np.abs((arms - angle[:, None] + np.pi) % (2 * np.pi) - np.pi)
-    best = off.argmin(axis=1)
-    return np.where(np.take_along_axis(off, best[:, None], axis=1)[:, 0] < MAX_TURN_RAD, best, NO_NEIGHBOUR)
+    return np.asarray(np.abs((arms - angle[:, None] + np.pi) % (2 * np.pi) - np.pi).argmin(axis=1))

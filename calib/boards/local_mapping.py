@@ -7,7 +7,7 @@ pass calibrated cameras are about 0.04 % too large.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -23,8 +23,8 @@ from calib.models.ocam import OcamCamera
 # Mappings of the board to the image about corners: of the numbers (M,) of corners, and offsets (M, K, 2) [squares] from
 # each of these, to pixels (M, K, 2).
 ToImage = Callable[[NDArray[np.intp], Array], Array]
-# Points of which a mapping is fitted: the nearest ones, its reach [squares], width of their Gaussian weight [squares].
-NEAREST, REACH, WEIGHT_WIDTH = 24, 3.0, 1.5
+# Reach of a mapping [squares]; the Gaussian weight of its points is half as wide.
+REACH = 3.0
 # Least numbers of points of a mapping of third, second and first order, which has 10, 6 and 3 terms.
 ORDERS = ((10, 16), (6, 10), (3, 4))
 # Least ratio of the mapping's singular values.
@@ -35,14 +35,8 @@ MAX_AHEAD = 1.1
 MAX_IRREGULARITY, MAX_IRREGULARITY_PX = 0.1, 0.4
 # Largest half side of the window in pixels, because farther grey levels do not depend on the corner's position.
 REACH_PX = 8
-# Width of the window's Gaussian weight as a fraction of its half side.
-WEIGHT_PART = 0.6
 # A last step is a fifth of the accuracy.
 MAX_ITERATIONS, CONVERGED_PX = 4, 2e-3
-# A corner that moves farther than this part of a square, plus some pixels, is reset: it has reached another edge.
-MAX_MOVE, MAX_MOVE_PX = 0.3, 0.3
-# Step of the difference quotient by which the size of a square is measured [squares]: a mapping bends within a square.
-SIZE_STEP = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +64,10 @@ def local_mapping(place: Array, at: Array, where: Array, *, exact: bool = False)
     """
     offset = at - place
     distance = np.linalg.norm(offset, axis=1)
-    near = np.argsort(distance, kind="stable")[:NEAREST]
-    near = near[distance[near] < REACH]
-    if not len(near) or distance[near[0]] > MAX_AHEAD:
+    near = np.flatnonzero(distance < REACH)
+    if not len(near) or distance[near].min() > MAX_AHEAD:
         return None
-    weight = np.exp(-((distance[near] / WEIGHT_WIDTH) ** 2) / 2)[:, None]
+    weight = np.exp(-2 * (distance[near] / REACH) ** 2)[:, None]
     x, y = offset[near].T
     terms = np.column_stack([quadratic_terms(x, y), x**3, x * x * y, x * y * y, y**3])
     for count, least in ORDERS if exact else ORDERS[1:]:
@@ -100,6 +93,16 @@ def mapping_of_others(points: Array, pixels: Array, k: int) -> LocalMapping | No
     return local_mapping(points[k], points[others], pixels[others], exact=True)
 
 
+def predicted_corners(grey: Grey, mappings: Sequence[LocalMapping], window: float) -> tuple[Array, Array]:
+    """Return the corners (M, 2) [px] that an image shows where mappings predict them, and their moves (M,) [squares].
+
+    window: half side [squares]; a corner is not sought farther than that.
+    """
+    shift = _corner_shifts(grey, _to_image(mappings), np.zeros((len(mappings), 2)), window)
+    pixels = _to_image(mappings)(np.arange(len(mappings)), shift[:, None])[:, 0]
+    return pixels, np.abs(shift).max(axis=1)
+
+
 def refined_corners(image: NDArray[np.uint8], points: Array, pixels: Array, window: float = WINDOW) -> Array:
     """Return pixels (N, 2) moved onto the image's corners; those without enough neighbours stay, NaN as well.
 
@@ -112,15 +115,13 @@ def refined_corners(image: NDArray[np.uint8], points: Array, pixels: Array, wind
         if not mappings:
             break
         # About the corner where it was found: the others only tell the shape of the window.
-        own = np.array([np.vstack([refined[k], found.coefficients[1:]]) for k, found in mappings.items()])
-
-        def to_image(which: NDArray[np.intp], xy: Array, own: Array = own) -> Array:
-            return np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ own[which])
-
-        offsets = _corner_offsets(grey, to_image, np.zeros((len(own), 2)), window)
-        moved = _unless_far(to_image, offsets, pixels[list(mappings)])
-        step_px = float(np.linalg.norm(moved - refined[list(mappings)], axis=1).max())
-        refined[list(mappings)] = moved
+        chosen = list(mappings)
+        own = [
+            LocalMapping(np.vstack([refined[k], found.coefficients[1:]]), found.gain) for k, found in mappings.items()
+        ]
+        moved, _ = predicted_corners(grey, own, window)
+        step_px = float(np.linalg.norm(moved - refined[chosen], axis=1).max())
+        refined[chosen] = moved
         if step_px < CONVERGED_PX:
             break
     return refined
@@ -160,33 +161,41 @@ def refine_with_camera(
         at = points[which, None] + board.square_m * np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=2)
         return camera.project_near(se3.apply(T_cam_board, at.reshape(-1, 3))).reshape(xy.shape)
 
-    grey, shift = image.astype(np.float32), np.zeros((len(seen), 2))
-    for _ in range(MAX_ITERATIONS):
-        step = _corner_offsets(grey, to_image, shift, board.window)
-        shift = shift + step
-        if not (np.abs(step) * _squares_px(to_image, shift)[:, None] > CONVERGED_PX).any():
-            break
+    shift = _corner_shifts(image.astype(np.float32), to_image, np.zeros((len(seen), 2)), board.window)
     refined = pixels.copy()
-    refined[seen] = _unless_far(to_image, shift, pixels[seen])
+    refined[seen] = to_image(np.arange(len(seen)), shift[:, None])[:, 0]
     return refined
 
 
-def _unless_far(to_image: ToImage, shift: Array, start: Array) -> Array:
-    """Return the pixels (M, 2) of shifted corners; start (M, 2) of those that have reached another edge."""
-    moved = to_image(np.arange(len(shift)), shift[:, None])[:, 0]
-    limit_px = MAX_MOVE * _squares_px(to_image, np.zeros_like(shift)) + MAX_MOVE_PX
-    return np.where((np.linalg.norm(moved - start, axis=1) < limit_px)[:, None], moved, start)
+def _to_image(mappings: Sequence[LocalMapping]) -> ToImage:
+    """Return local mappings as functions."""
+    own = np.array([mapping.coefficients for mapping in mappings])
+    return lambda which, xy: np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ own[which])
 
 
-def _squares_px(to_image: ToImage, shift: Array) -> Array:
-    """Return the sides (M,) of the squares at corners that are shifted (M, 2) [squares], in pixels."""
-    ends = to_image(np.arange(len(shift)), shift[:, None] + SIZE_STEP * np.array([[0.0, 0], [1, 0], [0, 1]]))
-    return np.asarray(np.sqrt(np.abs(np.linalg.det((ends[:, 1:] - ends[:, :1]) / SIZE_STEP))))
+def _corner_shifts(grey: Grey, to_image: ToImage, start: Array, window: float) -> Array:
+    """Return the shifts (M, 2) [squares] of corners to those of the image, by repeated steps from a start.
+
+    It is the start for those that leave the window: they have reached another edge.
+    """
+    shift = start
+    for _ in range(MAX_ITERATIONS):
+        step = _corner_offsets(grey, to_image, shift, window)
+        shift = shift + step
+        if not (np.abs(step) * _squares_px(to_image, shift, window)[:, None] > CONVERGED_PX).any():
+            break
+    return np.where(np.abs(shift - start).max(axis=1, keepdims=True) < window, shift, start)
+
+
+def _squares_px(to_image: ToImage, shift: Array, window: float) -> Array:
+    """Return the sides (M,) of the squares at corners that are shifted (M, 2) [squares], in pixels, over a window."""
+    ends = to_image(np.arange(len(shift)), shift[:, None] + window * np.array([[0.0, 0], [1, 0], [0, 1]]))
+    return np.asarray(np.sqrt(np.abs(np.linalg.det((ends[:, 1:] - ends[:, :1]) / window))))
 
 
 def _corner_offsets(grey: Grey, to_image: ToImage, shift: Array, window: float) -> Array:
     """Return the offsets (M, 2) [squares] of the corners in windows about places that are shifted (M, 2)."""
-    size = _squares_px(to_image, shift)
+    size = _squares_px(to_image, shift, window)
     reach = np.minimum(window, REACH_PX / np.maximum(size, 1e-6))
     # An odd number of samples along a side, about one a pixel; 5 at least, as the surface has six terms.
     side = np.clip(np.ceil(2 * reach * np.nan_to_num(size)), 5, 2 * REACH_PX).astype(int) // 2 * 2 + 1
@@ -207,7 +216,7 @@ def _window_fit(side: int) -> tuple[Array, Array, Array]:
     that maps weighted grey levels to the terms of the surface of second order.
     """
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, side)]), axis=-1).reshape(-1, 2)
-    weight = np.exp(-(grid**2).sum(axis=1) / (2 * WEIGHT_PART**2))
+    weight = np.exp(-(grid**2).sum(axis=1))
     return grid, weight, np.linalg.pinv(quadratic_terms(*grid.T) * weight[:, None])
 
 

@@ -24,18 +24,16 @@ TAGS_HINT = (
 )
 
 
-def search_board(image: Image, board: AnyBoard, name: str = "", *, thorough: bool) -> BoardView | None:
-    """Search a board of any kind in an image; name: of the view that is found. thorough: see `find_board`."""
-    if isinstance(board, Board):
-        return find_board(image, board, name, thorough=thorough)
-    return find_april_grid(image, board, name, thorough=thorough)
+def search_board(image: Image, board: AnyBoard, name: str = "") -> BoardView | None:
+    """Search a board of any kind in an image; name: of the view that is found."""
+    return find_board(image, board, name) if isinstance(board, Board) else find_april_grid(image, board, name)
 
 
-def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Progress = silent) -> list[BoardView]:
+def find_boards(images: Images, board: AnyBoard, progress: Progress = silent) -> list[BoardView]:
     """Find the views of a board in images, on all cores; raises OmnidError if there is none."""
     views = list[BoardView]()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        searches = pool.map(lambda name: search_board(images[name], board, name, thorough=thorough), images)
+        searches = pool.map(lambda name: search_board(images[name], board, name), images)
         for number, (name, view) in enumerate(zip(images, searches, strict=True), 1):
             outcome = "no board"
             if view is not None:

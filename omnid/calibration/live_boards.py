@@ -124,7 +124,7 @@ class LiveBoards:
         """
         # 1. Search the board.
         self._update_rims(images)
-        lower, upper = self._pool.map(lambda image: search_board(image, self._board, thorough=False), images)
+        lower, upper = self._pool.map(lambda image: search_board(image, self._board), images)
         before, self._before, self.views = self._before, (lower, upper), (lower, upper)
         # 2. Leave out pairs that add no information.
         if lower is None and upper is None:

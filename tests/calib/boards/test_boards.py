@@ -1,4 +1,4 @@
-"""Boards in rendered mirror images: noise, shadow, low contrast, accuracy; AprilTag grids; images without a board."""
+"""Boards in rendered mirror images: noise, low contrast, accuracy; AprilTag grids; images without a board."""
 
 from __future__ import annotations
 
@@ -48,19 +48,16 @@ def errors_px(found: Array, truth: Array) -> Array:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("sensor", "contrast", "shadow", "limit_px"),
+    ("sensor", "contrast", "limit_px"),
     [
-        (Sensor(), (25.0, 225.0), 1.0, 0.08),
-        (Sensor(noise_sigma=6.0), (25.0, 225.0), 1.0, 0.5),
-        (Sensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 1.0, 0.5),
-        (Sensor(), (25.0, 225.0), 0.3, 0.5),
+        (Sensor(), (25.0, 225.0), 0.08),
+        (Sensor(noise_sigma=6.0), (25.0, 225.0), 0.5),
+        (Sensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 0.5),
     ],
 )
-def test_finds_boards_on_all_sides(
-    sensor: Sensor, contrast: tuple[float, float], shadow: float, limit_px: float
-) -> None:
+def test_finds_boards_on_all_sides(sensor: Sensor, contrast: tuple[float, float], limit_px: float) -> None:
     for seed, T in enumerate(poses(3)):
-        rendered = RENDERER.render_board(T, seed=seed, sensor=sensor, contrast=contrast, shadow=shadow)
+        rendered = RENDERER.render_board(T, seed=seed, sensor=sensor, contrast=contrast)
         view = find_board(rendered.image, BOARD, "x")
         assert view is not None and np.isfinite(view.pixels).mean() > 0.7, seed
         off = errors_px(view.pixels, rendered.corners)
@@ -162,7 +159,7 @@ def test_tags_elsewhere_than_on_the_grid_are_no_grid() -> None:
 @pytest.mark.parametrize(
     ("sizes", "words"),
     [
-        ((6, 6, float("nan"), 0.3), "tags of 0.1 mm to 10 m"),
+        ((6, 6, float("nan"), 0.3), "tags of a length above 0"),
         ((6, 6, 0.08, 24.0), "like Kalibr's tagSpacing, found 24"),
         ((30, 30, 0.08, 0.3), "expected 1 to 587 tags, .* found 30x30"),
     ],
