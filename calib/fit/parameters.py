@@ -1,12 +1,11 @@
 """Parameters of cameras and rigs in fits: names, units, and what is known of them before a fit.
 
 One step of a parameter moves the image by about a pixel. Its prior is the covariance of the rig's calibration, or the
-tolerance of a nominal rig, whose numbers come from the mirror's data sheet, its rim in the images, and a ruler.
+tolerance of a nominal rig.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -26,28 +25,15 @@ from calib.rig import Rig, ShutterTimes
 # One step of a wavefront's coefficient [m] moves a board at half a metre by about half a pixel.
 WAVEFRONT_UNIT_M: Final = 1e-3
 # The length of the baseline is no parameter of a drive, whose images do not determine the scale.
-TRANSFORM_NAMES: Final = RIG_TRANSFORM_NAMES[:-1]
+TRANSFORM_NAMES: Final = tuple(name for name in RIG_TRANSFORM_NAMES if name != "baseline")
+# One step of an angle; of a time it is what passes during that turn at 1 rad/s.
 ANGLE_UNIT_RAD: Final = 1.0 / 250.0
-# Times of exposure; a step is one of their units.
-UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
-TIMES: Final = (UPPER_DELAY, LINE_TIME)
-S_PER_UNIT: Final = {UPPER_DELAY: 1e-3, LINE_TIME: 1e-6}
-# Tolerances of a nominal rig in the parameters' own units, by the name without its camera: those of mount and trigger,
-# and of a mirror whose rays pass the viewpoint within about a millimetre.
-NOMINAL_SIGMAS: Final[dict[str, float]] = {
-    **dict.fromkeys(("r_x", "r_y", "r_z"), math.radians(1.5)),
-    **dict.fromkeys(("e_x", "e_y"), math.radians(2.0)),
-    **dict.fromkeys(("pu", "pv", "center_row", "center_column"), 3.0),
-    **{UPPER_DELAY: 15.0, LINE_TIME: 30.0, "xi": 0.02},
-    **dict.fromkeys(WAVEFRONT_NAMES, 1e-3),
-}
-# Tolerances of distortion terms, in steps.
-NOMINAL_STEPS: Final = {
-    **dict.fromkeys(("p1", "p2"), 3.0),
-    **dict.fromkeys(("k1", "k2", "c", "d", "s1", "s2"), 1.0),
-}
-# Tolerance of focal lengths and polynomials as a fraction of their value, and of terms beyond a paraboloid's in steps.
-RELATIVE_SIGMA, HIGHER_STEPS = 0.02, 0.5
+TIMES: Final = ("upper delay [s]", "line time [s]")
+UPPER_DELAY, LINE_TIME = TIMES
+# Tolerances of a nominal rig in steps, which are about pixels: of what a data sheet, the rim in the images and a ruler
+# state, and of the terms of a shape that is not quite the model's.
+STATED_STEPS, SHAPE_STEPS = 5.0, 1.0
+SHAPE_NAMES: Final = ("k1", "k2", "c", "d", *ASTIGMATISM_NAMES, *WAVEFRONT_NAMES)
 RULER_SIGMA_M: Final = 0.5e-3
 # Least sigma of a calibrated parameter, as a fraction of the nominal one: mirrors are knocked and metal grows.
 MIN_PART: Final = 1e-3
@@ -151,9 +137,7 @@ class RigParameters:
     @property
     def values(self) -> Array:
         """Values (P,) at steps of 0, in the parameters' own units; those of the transform are 0 rad."""
-        times = self.rig.times
-        known = {UPPER_DELAY: times.upper_delay_s / S_PER_UNIT[UPPER_DELAY]}
-        known[LINE_TIME] = times.line_time_s / S_PER_UNIT[LINE_TIME]
+        known = {UPPER_DELAY: self.rig.times.upper_delay_s, LINE_TIME: self.rig.times.line_time_s}
         for side, mounted in self.rig.sides:
             known |= {f"{side} {name}": value for name, value in values_of(mounted.camera).items()}
         return np.array([known.get(name, 0.0) for name in self.names])
@@ -161,7 +145,8 @@ class RigParameters:
     @property
     def units(self) -> Array:
         """One step (P,) in the parameters' own units."""
-        known = dict.fromkeys(TRANSFORM_NAMES, ANGLE_UNIT_RAD) | dict.fromkeys(TIMES, 1.0)
+        known = dict.fromkeys((*TRANSFORM_NAMES, UPPER_DELAY), ANGLE_UNIT_RAD)
+        known[LINE_TIME] = ANGLE_UNIT_RAD / self.rig.lower.camera.size[1]
         for side, mounted in self.rig.sides:
             own = [name.partition(" ")[2] for name in self.names if name.startswith(f"{side} ")]
             units = units_of(mounted.camera, own).tolist()
@@ -171,14 +156,9 @@ class RigParameters:
     @property
     def nominal_sigmas(self) -> Array:
         """Standard deviations (P,) of the steps of a nominal rig."""
-        sigmas = []
-        for name, value, unit in zip(self.names, self.values.tolist(), self.units.tolist(), strict=True):
-            own = name if name in TIMES else name.split()[-1]
-            relative = RELATIVE_SIGMA * abs(value) / unit
-            is_higher = is_coefficient(own) and int(own[1:]) > 2
-            steps = NOMINAL_STEPS.get(own, np.hypot(HIGHER_STEPS, relative) if is_higher else relative)
-            sigmas.append(NOMINAL_SIGMAS[own] / unit if own in NOMINAL_SIGMAS else steps)
-        return np.array(sigmas)
+        own = [name.split()[-1] for name in self.names]
+        is_shape = [name in SHAPE_NAMES or (is_coefficient(name) and int(name[1:]) > 2) for name in own]
+        return np.where(is_shape, SHAPE_STEPS, STATED_STEPS)
 
     def prior(self) -> Array:
         """Return the information (P, P) of the steps about zero, by the rig's covariance as far as it has one."""
@@ -203,9 +183,11 @@ class RigParameters:
 
     def times_at(self, steps: Array) -> ShutterTimes:
         """Return the times of exposure after steps (P,); a time that is no parameter stays that of the rig."""
-        own = dict(zip(self.times, steps[len(self.names) - len(self.times) :].tolist(), strict=True))
-        upper_s, line_s = (own.get(name, 0.0) * S_PER_UNIT[name] for name in TIMES)
-        return ShutterTimes(self.rig.times.upper_delay_s + upper_s, self.rig.times.line_time_s + line_s)
+        own = dict(zip(self.names, (steps * self.units).tolist(), strict=True))
+        times = self.rig.times
+        return ShutterTimes(
+            times.upper_delay_s + own.get(UPPER_DELAY, 0.0), times.line_time_s + own.get(LINE_TIME, 0.0)
+        )
 
     def transform_steps(self, rig: Rig) -> Array:
         """Return the steps (P,) that give this rig the transform between the cameras of another; all others are 0."""
@@ -227,13 +209,10 @@ class RigParameters:
         gain, variance = np.zeros(len(names)), RULER_SIGMA_M**2
         if known is not None and "baseline" in known.names:
             chosen = [k for k, name in enumerate(names) if name in known.names]
-            prior = known.select([*(names[k] for k in chosen), "baseline"]).matrix
-            scale = np.sqrt(np.maximum(np.diag(prior)[:-1], np.finfo(float).tiny))
-            try:
-                gain[chosen] = np.linalg.solve(prior[:-1, :-1] / np.outer(scale, scale), prior[:-1, -1] / scale) / scale
-            except np.linalg.LinAlgError:
-                raise CalibError("calibrate drive: the covariance of the rig's file is singular") from None
-            variance = max(0.0, float(prior[-1, -1] - gain[chosen] @ prior[:-1, -1]))
+            prior = known.select([*(names[k] for k in chosen), "baseline"])
+            share = np.linalg.pinv(prior.correlation[:-1, :-1], hermitian=True) @ prior.correlation[:-1, -1]
+            gain[chosen] = share * prior.sigmas[-1] / np.maximum(prior.sigmas[:-1], np.finfo(float).tiny)
+            variance = prior.sigmas[-1] ** 2 * max(0.0, 1 - float(share @ prior.correlation[:-1, -1]))
         J = np.vstack([np.eye(len(names)), gain])
         matrix = J @ covariance @ J.T
         matrix[-1, -1] += variance

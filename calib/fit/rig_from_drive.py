@@ -23,14 +23,12 @@ from calib.errors import CalibError
 from calib.fit.least_squares import (
     BEST_STEP,
     KERNEL_WIDTH,
-    LOST_PX,
     ROUNDS,
     ArrowSystem,
     minimise,
     robust_sigma,
 )
 from calib.fit.parameters import RigParameters
-from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
 from calib.models.ocam import project_near
 from calib.rig import Rig
@@ -43,10 +41,6 @@ MAX_SIGMA_PX = 1.0
 # A search ends where a step reduces the cost by less than a share of it: the rough one while landmarks are still
 # selected, because the search goes on with the next selection, the fine one at the end.
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
-# Information of parameters that stay.
-HELD = 1e12
-# About six times the number of parameters of a rig. Fewer landmarks would not show that a parameter is wrong.
-MIN_LANDMARKS = 100
 # Observations that count as one corner of a calibration by boards: errors of a patch are correlated in both cameras and
 # from keyframe to keyframe (0.9 in rendered rooms).
 CORRELATED_OBSERVATIONS = 10.0
@@ -93,17 +87,11 @@ class DriveAdjustment:
     observations: DriveObservations  # those that were used
     covariance: Array  # (P, P) of the steps
     sigma_px: float  # of one coordinate of an observation
-    residuals: Array  # (M, 2) measured minus modelled pixels
 
     @property
     def rig(self) -> Rig:
         """The adjusted rig."""
         return self.parameters.at(self.state.steps)
-
-    def structure(self, side: int) -> ResidualStructure:
-        """Return the systematic part and the noise of the residuals in the lower (0) or in the upper (1) image."""
-        seen, mounted = self.observations.camera == side, (self.rig.lower, self.rig.upper)[side]
-        return residual_structure(self.observations.pixels[seen], self.residuals[seen], mounted.camera.center)
 
 
 def adjust_drive(
@@ -118,7 +106,7 @@ def adjust_drive(
 
     fixed: keyframes whose pose stays, one for each drive. correlated: number of observations that count as one
     independent one; the weight of the prior of the parameters is multiplied by it.
-    CalibError where fewer than MIN_LANDMARKS landmarks agree.
+    CalibError where fewer landmarks agree than the rig has parameters.
     """
     prior = parameters.prior()
     problem = DriveProblem(parameters, observations, correlated * prior, np.asarray(fixed))
@@ -131,34 +119,23 @@ def adjust_drive(
                 f"calibrate drive: the landmarks are {sigma_px:.1f} px off any rig and path, expected "
                 f"{MAX_SIGMA_PX:.0f} px at most; is the rig that of these cameras?"
             )
-        if len(used) < MIN_LANDMARKS:
+        if len(used) < len(prior):
             raise CalibError(
-                f"calibrate drive: only {len(used)} landmarks agree with a rigid world, {MIN_LANDMARKS} "
+                f"calibrate drive: only {len(used)} landmarks agree with a rigid world, {len(prior)} "
                 "are needed; is the rig that of these cameras, is there enough to see?"
             )
         observations, state = kept, replace(state, points=state.points[used])
         problem = replace(problem, observations=observations)
         state, sigma_px = problem.minimised(state, FINE_GAIN if number == ROUNDS - 1 else ROUGH_GAIN)
     covariance = problem.covariance(state, sigma_px, correlated**2 * prior)
-    return DriveAdjustment(parameters, state, observations, covariance, sigma_px, problem.residuals(state))
-
-
-def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations) -> Array:
-    """Return the steps (P,) by points that both cameras saw at once, near those of the state: a start for a drive.
-
-    The only condition is that the rays of both cameras meet: it determines the columns of the panoramas, but no length.
-    The poses of all keyframes stay; wherever they are, the result is the same.
-    """
-    problem = DriveProblem(parameters, observations, parameters.prior(), np.arange(len(state.T_rig_odom)))
-    return problem.minimised(state, ROUGH_GAIN)[0].steps
+    return DriveAdjustment(parameters, state, observations, covariance, sigma_px)
 
 
 def observation_sigma(rig: Rig, found: DriveAdjustment, fixed: Sequence[int] = (0,)) -> float:
     """Return the sigma [px] of one coordinate with another rig, which stays; poses and landmarks are adjusted."""
-    parameters = RigParameters.about(rig)
-    still = np.zeros(len(parameters.names))
-    problem = DriveProblem(parameters, found.observations, np.eye(len(still)) * HELD, np.asarray(fixed))
-    return problem.minimised(replace(found.state, steps=still), ROUGH_GAIN)[1]
+    none = RigParameters(rig, ())
+    problem = DriveProblem(none, found.observations, np.zeros((0, 0)), np.asarray(fixed))
+    return problem.minimised(replace(found.state, steps=np.zeros(0)), ROUGH_GAIN)[1]
 
 
 def project(rig: Rig, camera: Indices, points: Array) -> Array:
@@ -199,10 +176,10 @@ class DriveProblem:
         return np.asarray(firm & (squared < (2 * KERNEL_WIDTH * sigma_px) ** 2))
 
     def residuals(self, state: DriveState) -> Array:
-        """Return measured minus modelled pixels (M, 2); LOST_PX where the model has no image."""
+        """Return measured minus modelled pixels (M, 2); the image's diagonal where the model has no image."""
         seen = self.observations
         cast = project(self.parameters.at(state.steps), seen.camera, self.in_rig(state, state.steps))
-        return np.where(np.isfinite(cast), seen.pixels - cast, LOST_PX)
+        return np.where(np.isfinite(cast), seen.pixels - cast, np.hypot(*self.parameters.rig.lower.camera.size))
 
     def in_rig(self, state: DriveState, steps: Array) -> Array:
         """Return the landmark (M, 3) of each observation in the rig frame at the time of its exposure."""
@@ -229,11 +206,11 @@ class DriveProblem:
 
     def moved(self, state: DriveState, common: Array, blocks: Array) -> DriveState | None:
         """Return the state after steps of poses and rig (C,) and of landmarks (L, 3); None without such a camera."""
-        P = len(self.prior)
+        of_poses, of_rig = np.split(common, [len(common) - len(self.prior)])
         T = state.T_rig_odom.copy()
         free = np.setdiff1d(np.arange(len(T)), self.fixed)
-        T[free] = se3.exp(common[:-P].reshape(-1, 6)) @ T[free]
-        moved = replace(state, T_rig_odom=T, points=state.points + blocks, steps=state.steps + common[-P:])
+        T[free] = se3.exp(of_poses.reshape(-1, 6)) @ T[free]
+        moved = replace(state, T_rig_odom=T, points=state.points + blocks, steps=state.steps + of_rig)
         try:
             self.parameters.at(moved.steps)
         except CalibError:
@@ -285,7 +262,7 @@ class DriveProblem:
         in_rig = self.in_rig(state, state.steps)
         by_rig_point = self._by_point(state.steps, in_rig) * root[:, :, None]
         by_pose = np.concatenate([by_rig_point, -by_rig_point @ se3.hat(in_rig)], axis=2)
-        by_steps = (self._by_steps(state) * root[:, :, None]).reshape(-1, len(self.prior))
+        by_steps = (self._by_steps(state) * root[:, :, None]).reshape(residual.size, len(self.prior))
         J_poses = _scattered(by_pose, seen.keyframe, len(state.T_rig_odom))
         is_free = np.repeat(~np.isin(np.arange(len(state.T_rig_odom)), self.fixed), 6)
         of_landmarks = by_rig_point @ se3.R_of(state.T_rig_odom[seen.keyframe])

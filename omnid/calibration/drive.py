@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.fit.least_squares import ROUNDS
-from calib.fit.parameters import NOMINAL_SIGMAS, TIMES, RigParameters
-from calib.fit.residual_structure import ResidualStructure
+from calib.fit.parameters import TIMES, RigParameters
 from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_from_drive import (
     CORRELATED_OBSERVATIONS,
     DriveAdjustment,
     adjust_drive,
-    adjust_pairs,
     observation_sigma,
 )
 from calib.fit.rig_uncertainty import drive_uncertainty
@@ -29,9 +27,8 @@ from calib.rig_file import read_rig
 from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import Progress
-from omnid.calibration.drive_observations import Drives, collect, observe_pairs
-from omnid.calibration.images import SIDES
-from omnid.calibration.rig_check import MAX_SKEW_S, check_rig, read_rig_pairs, with_masks
+from omnid.calibration.drive_observations import Drives, collect
+from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.rig.rig_health import SIGMAS
 from omnid.core.stereo.triangulation import common_perpendicular
@@ -39,9 +36,6 @@ from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
 
-# Relative change of lengths in a round below which no further round is needed: a third of the scale's sigma after a
-# drive (0.3 % in rendered rooms).
-SETTLED = 1e-3
 # Error of the landmarks with the new rig, as a fraction of that with the old one. Free parameters always lower the
 # error a little, so a smaller gain does not show a better rig.
 SMALL_GAIN = 0.95
@@ -58,31 +52,21 @@ class DriveCalibration:
     adjustment: DriveAdjustment
     first_sigma_px: float  # of an observation with the rig as it was
     scale_change: float  # relative change of lengths against the rig before
-    structure: tuple[ResidualStructure, ResidualStructure]  # of the residuals in the lower and the upper image
     drives: Drives
 
     def __str__(self) -> str:
         uncertainty, adjustment = drive_uncertainty(self.rig), self.adjustment
         return (
-            f"{'MISFIT: the residuals are not noise. ' if self.is_misfit else ''}{self.drives.keyframes} keyframes, "
-            f"{len(adjustment.state.points)} landmarks, {len(adjustment.observations)} observations; error "
-            f"{self.first_sigma_px:.3f} px before, {adjustment.sigma_px:.3f} px after, lengths change by "
-            f"{100 * self.scale_change:+.3f} %" + (f"; drives: {uncertainty}" if uncertainty else "")
+            f"{self.drives.keyframes} keyframes, {len(adjustment.state.points)} landmarks, "
+            f"{len(adjustment.observations)} observations; error {self.first_sigma_px:.3f} px before, "
+            f"{adjustment.sigma_px:.3f} px after, lengths change by {100 * self.scale_change:+.3f} %"
+            + (f"; drives: {uncertainty}" if uncertainty else "")
         )
-
-    def lines(self) -> list[str]:
-        """Return the result as lines: errors before and after with the change of lengths, residuals of each camera."""
-        return [str(self), *(f"{side}: {structure}" for side, structure in zip(SIDES, self.structure, strict=True))]
 
     @property
     def is_better(self) -> bool:
         """True if the landmarks fit better than with the rig before by more than further parameters always bring."""
         return self.adjustment.sigma_px <= SMALL_GAIN * self.first_sigma_px
-
-    @property
-    def is_misfit(self) -> bool:
-        """True if the model leaves more than the noise explains."""
-        return any(structure.is_misfit for structure in self.structure)
 
 
 def calibrate_drive(
@@ -107,7 +91,7 @@ def calibrate_drive(
     parameters = RigParameters.about(before, DISTORTION, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
     start = straightened(paths[0], parameters, cameras, config, progress)
-    require_same_rig(parameters, start, tracked=False)
+    require_same_rig(parameters, start)
     # 3. Track and adjust in rounds, until lengths change no more.
     found, drives = _in_rounds(paths, parameters, start, cameras, config, progress)
     # 4. Refuse what is another rig.
@@ -121,7 +105,6 @@ def calibrate_drive(
         observation_sigma(before, found, drives.fixed),
         # By the rays of the adjustment, and by the length of the baseline.
         scale_change(found, before) + float(np.log(adjusted.baseline_m / before.baseline_m)),
-        (found.structure(0), found.structure(1)),
         drives,
     )
 
@@ -131,25 +114,16 @@ def straightened(
 ) -> Array:
     """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
     rig = parameters.rig
-    pairs = read_rig_pairs(log, rig, cameras)
-    finding = check_rig(pairs, rig, config.panorama).finding
+    finding = check_rig(read_rig_pairs(log, rig, cameras), rig, config.panorama).finding
     progress(finding.summary)
     if finding.drift is None:
         raise OmnidError(
             f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not exchanged, "
             "and is there enough to see?"
         )
-    # Errors of a centre have the effect of a shifted viewpoint, so only the rotation is a start.
-    steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
-    if float(np.median([abs(pair.skew_s) for pair in pairs])) > MAX_SKEW_S:
-        return steps  # the motion between the exposures would be taken for errors of the centres
-    # Each round matches in panoramas that the one before has straightened, so that wrong matches become fewer.
-    for _ in range(ROUNDS):
-        state, observations = observe_pairs(pairs, parameters.at(steps), config)
-        steps = adjust_pairs(parameters, replace(state, steps=steps), observations)
-    finding = check_rig(pairs, parameters.at(steps), config.panorama).finding
-    progress(finding.summary)
-    return steps
+    # Errors of a centre, and the motion between two exposures, have the effect of a shifted viewpoint, so only the
+    # rotation is a start.
+    return parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
 
 
 def _in_rounds(
@@ -167,23 +141,23 @@ def _in_rounds(
     rig = parameters.at(steps)
     for number in range(1, ROUNDS + 2):
         drives = collect(logs, rig, cameras, config)
-        found = _adjusted(parameters, steps, drives)
+        found = adjust_drive(
+            parameters,
+            replace(drives.state, steps=steps),
+            drives.observations,
+            drives.fixed,
+            correlated=1.0 if parameters.rig.covariance is None else CORRELATED_OBSERVATIONS,
+        )
         moved = scale_change(found, rig)
         steps, rig = found.state.steps, found.rig
         progress(
             f"round {number}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
             f"{found.sigma_px:.3f} px, lengths {100 * moved:+.3f} %"
         )
-        if number > 1 and abs(moved) < SETTLED:
+        uncertainty = drive_uncertainty(_finished_rig(parameters.rig, found))
+        if number > 1 and uncertainty is not None and abs(moved) < uncertainty.scale / 2:
             break
     return found, drives
-
-
-def _adjusted(parameters: RigParameters, steps: Array, drives: Drives) -> DriveAdjustment:
-    correlated = 1.0 if parameters.rig.covariance is None else CORRELATED_OBSERVATIONS
-    return adjust_drive(
-        parameters, replace(drives.state, steps=steps), drives.observations, drives.fixed, correlated=correlated
-    )
 
 
 def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:
@@ -193,7 +167,7 @@ def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:
     change = found.state.steps[: len(names)] * units
     covariance = found.covariance[: len(names), : len(names)] * np.outer(units, units)
     baseline_m, matrix = parameters.baseline(change, covariance)
-    rig = rescaled(found.rig, baseline_m / before.baseline_m)
+    rig = found.rig.with_upper_moved(np.zeros(3), np.zeros(2), baseline_m - before.baseline_m)
     return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))
 
 
@@ -217,42 +191,14 @@ def _ranges(rig: Rig, pixels: Sequence[Array]) -> Array:
     return np.asarray(np.linalg.norm(points, axis=1))
 
 
-def rescaled(rig: Rig, ratio: float) -> Rig:
-    """Return the rig with a longer or shorter baseline: all lengths of its odometry change by that ratio."""
-    viewpoint = rig.lower.viewpoint + ratio * (rig.upper.viewpoint - rig.lower.viewpoint)
-    R_upper_rig = se3.R_of(rig.upper.T_cam_rig)
-    return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.transform(R_upper_rig, -R_upper_rig @ viewpoint)))
-
-
-# Largest rotation of the upper camera, and of the baseline's direction, against a rig with a covariance. Without one
-# the rig may be nominal: three sigmas of a mount.
-MAX_TURN_RAD = np.deg2rad(2.8)
-
-
-def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> None:
-    """Raise OmnidError where the drive asks for another rig, after steps (P,), than the one of the parameters.
-
-    tracked: False before the motion is known: an upper camera that is exposed late then appears shifted.
-    """
-    change = (steps * parameters.units)[parameters.of_transform]
-    turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
-    limit = 3 * NOMINAL_SIGMAS["r_x"] if parameters.rig.covariance is None else MAX_TURN_RAD
-    away = np.abs(steps / parameters.nominal_sigmas)[: parameters.of_transform.start]
+def require_same_rig(parameters: RigParameters, steps: Array) -> None:
+    """Raise OmnidError where steps (P,) lead beyond what another mount or mirror of the same kind differs by."""
+    away = np.abs(steps / parameters.nominal_sigmas)[: len(parameters.rig_names)]
     worst = int(np.argmax(away))
-    if max(turn, lean) > limit:
-        reason = (
-            f"the upper camera is turned by {np.rad2deg(turn):.1f} deg and its baseline by {np.rad2deg(lean):.1f} deg "
-            f"against the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
-        )
-    elif away[worst] > SIGMAS:
+    if away[worst] > SIGMAS:
         old, new = parameters.values[worst], (parameters.values + steps * parameters.units)[worst]
-        reason = (
-            f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "
-            "same camera and mirror"
+        raise OmnidError(
+            f"calibrate drive: {parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than "
+            f"{SIGMAS:g} tolerances of a nominal rig; is the rig that of these cameras? Nothing is written for another "
+            "one: start from its own or nominal rig"
         )
-    else:
-        return
-    raise OmnidError(
-        f"calibrate drive: {reason}; is the rig that of these cameras? Nothing is written for another "
-        "one: start from its own or nominal rig"
-    )

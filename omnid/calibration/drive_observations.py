@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -14,16 +13,14 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.fit.rig_from_drive import DriveObservations, DriveState
 from calib.rig import Rig
-from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.config import Config
 from omnid.core.rig.drive_landmarks import DriveLandmarks, in_images
-from omnid.core.rig.rig_health import RigHealth, RigState, match
-from omnid.core.stereo.triangulation import triangulate
+from omnid.core.rig.rig_health import RigHealth, RigState
 from omnid.errors import OmnidError
-from omnid.messages import FramePair, OdometryUpdate
+from omnid.messages import OdometryUpdate
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import Dewarp, Geometry, geometry
+from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
@@ -32,10 +29,6 @@ Array = NDArray[np.float64]
 KEYFRAME_M, KEYFRAME_RAD = 0.12, np.deg2rad(8)
 MAX_KEYFRAMES = 80  # Most keyframes of all drives: on long drives they are farther apart.
 MIN_KEYFRAMES = 15
-# Least turn of all drives together: on a straight line tilt and direction of motion are one.
-MIN_TURN_RAD = np.deg2rad(60)
-MIN_PATH_M = 2.0  # the same landmarks must be seen from near and from far
-MAX_LOST = 0.2  # share of the pairs
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +46,18 @@ class Drives:
 
 
 def collect(logs: Sequence[Path], rig: Rig, cameras: LogCameras, config: Config) -> Drives:
-    """Return the observations of drives; OmnidError where they are too short or too straight."""
+    """Return the observations of drives; OmnidError where they are too short."""
     place = geometry(rig, config.panorama)
     parts = [_drive(log, place, cameras, config, MAX_KEYFRAMES // len(logs)) for log in logs]
     states, seen = [part.state for part in parts], [part.observations for part in parts]
     keyframes = np.cumsum([0, *(part.keyframes for part in parts)])
     landmarks = np.cumsum([0, *(len(state.points) for state in states)])
     T_rig_odom = np.concatenate([state.T_rig_odom for state in states])
-    require_motion(T_rig_odom, len(logs))
+    if len(T_rig_odom) < MIN_KEYFRAMES:
+        raise OmnidError(
+            f"calibrate drive: only {len(T_rig_odom)} views {KEYFRAME_M} m or "
+            f"{np.rad2deg(KEYFRAME_RAD):.0f} deg apart, {MIN_KEYFRAMES} are needed; take a longer drive"
+        )
     observations = DriveObservations(
         np.concatenate([part.keyframe + first for part, first in zip(seen, keyframes, strict=False)]),
         np.concatenate([part.landmark + first for part, first in zip(seen, landmarks, strict=False)]),
@@ -72,30 +69,6 @@ def collect(logs: Sequence[Path], rig: Rig, cameras: LogCameras, config: Config)
     )
     state = DriveState(T_rig_odom, points, twist, upper_delay_s, np.zeros(0))
     return Drives(state, observations, tuple(keyframes[:-1].tolist()))
-
-
-def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple[DriveState, DriveObservations]:
-    """Return points that both cameras saw at once, each pair a keyframe in one place, without tracking."""
-    place = geometry(rig, config.panorama)
-    dewarp, model = Dewarp(place, config.panorama), place.model(config.odometry.noise_px)
-    found: list[tuple[Array, Array, Array]] = []
-    for number, pair in enumerate(pairs):
-        panoramas = dewarp.process(pair)
-        matches = match(panoramas.lower, panoramas.upper, panoramas.visible)
-        found.append((np.full(len(matches.lower), number), matches.lower, matches.upper))
-    keyframe, lower, upper = (np.concatenate([part[k] for part in found]) for k in range(3))
-    points = se3.apply(
-        place.T_rig_rect, triangulate(np.column_stack([lower, upper[:, 1]]), model.cylinder, model.baseline_m)
-    )
-    seen = DriveObservations(
-        np.tile(keyframe, 2),
-        np.tile(np.arange(len(points)), 2),
-        np.repeat([0, 1], len(points)),
-        np.concatenate([lower, upper]),
-    )
-    observations, points = in_images(seen, points, rig, place.cylinder)
-    T = np.tile(np.eye(4), (len(pairs), 1, 1))
-    return DriveState(T, points, np.zeros((len(pairs), 6)), np.zeros(len(pairs)), np.zeros(0)), observations
 
 
 def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most: int) -> Drives:
@@ -133,37 +106,8 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
 def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log: Path) -> Iterator[OdometryUpdate]:
     """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras."""
     pairing, health = Synchronise(front_end.geometry.rig, config.pair), front_end.health
-    states: Counter[TrackingState] = Counter()
     for pair in filter(None, map(pairing.process, reader.frames())):
         update = front_end.pose(pair)
-        states[update.state] += 1
         if health.state is RigState.EXCHANGED:
             raise OmnidError(f"{log}: {health.warning}")
         yield update
-    if not states or states[TrackingState.LOST] > MAX_LOST * states.total():
-        raise OmnidError(
-            f"{log}: the pose is lost in {states[TrackingState.LOST]} of {states.total()} pairs with this "
-            "rig; start from one that is nearer to the truth, or take a drive where there is more to see"
-        )
-
-
-def require_motion(T_rig_odom: Array, drives: int) -> None:
-    """Raise OmnidError where the drives are too short or too straight."""
-    if len(T_rig_odom) < MIN_KEYFRAMES:
-        raise OmnidError(
-            f"calibrate drive: only {len(T_rig_odom)} views {KEYFRAME_M} m or "
-            f"{np.rad2deg(KEYFRAME_RAD):.0f} deg apart, {MIN_KEYFRAMES} are needed; take a longer drive"
-        )
-    T_odom_rig = se3.inverse(T_rig_odom)
-    path_m = float(np.linalg.norm(np.diff(se3.t_of(T_odom_rig), axis=0), axis=1).sum())
-    if path_m < MIN_PATH_M:
-        raise OmnidError(
-            f"calibrate drive: the path is {path_m:.1f} m long, {MIN_PATH_M:.0f} m are needed: turns on "
-            "the spot show nothing from near and from far; take a longer drive"
-        )
-    heading = se3.yaw(T_odom_rig)
-    if np.ptp(np.concatenate([[0.0], np.cumsum(wrapped(np.diff(heading)))])) < MIN_TURN_RAD:
-        raise OmnidError(
-            f"calibrate drive: {drives} drive(s) turn by less than {np.rad2deg(MIN_TURN_RAD):.0f} deg; on "
-            "a straight line some errors of the rig look like motion: take a drive with turns"
-        )

@@ -10,13 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from calib.fit.rig_drift import SHIFT_SIGMA_RAD
 from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import TOLERANCE_NS, spread_pairs
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.rig_health import (
-    DRIFTED_PX,
     MIN_MATCHES,
     RigFinding,
     RigState,
@@ -32,7 +30,6 @@ from omnid.stages.synchronise import Decoder
 PAIRS: Final = 24
 # Median time between the exposures of the pairs: the stamps of cameras that are triggered together scatter by less.
 MAX_SKEW_S: Final = 3e-3
-RECALIBRATE = "the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +39,6 @@ class RigCheckResult:
     finding: RigFinding
     pairs: int  # that were compared
     skew_s: float  # median time from the lower camera's exposure to the upper one's
-
-    @property
-    def has_changed_intrinsics(self) -> bool:
-        """True if the columns show a change other than that of the upper camera's pose."""
-        shift = np.zeros(2) if self.finding.drift is None else self.finding.drift.shift
-        # A mirror hardly moves by two sigmas to the side; a camera's centre that is some pixels off has this effect.
-        return self.finding.left_px > DRIFTED_PX or bool(np.linalg.norm(shift) > 2 * SHIFT_SIGMA_RAD)
 
     def __str__(self) -> str:
         """Return the result as lines of text, the condition first."""
@@ -60,7 +50,6 @@ class RigCheckResult:
             lines += [
                 f"upper viewpoint: shifted by {shift} deg, as seen from the lower one",
                 f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
-                *[RECALIBRATE] * self.has_changed_intrinsics,
             ]
         return "\n".join(lines)
 
