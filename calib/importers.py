@@ -25,6 +25,7 @@ from calib.models.names import camera_of, sees_directly
 from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.rig import (
+    MAX_LEAN,
     MountedCamera,
     Rig,
     ShutterTimes,
@@ -36,8 +37,6 @@ from calib.typed_toml import shown
 from calib.validation import Warn, load_yaml, read_text, require_image_size, silent, transform_of
 
 Matrix: TypeAlias = tuple[tuple[float, ...], ...]
-# Largest angle of the baseline from z of the rig: no rig leans so far, but the axes of an IMU may be others.
-MAX_LEAN_RAD: Final = np.deg2rad(30)
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
 _FOCAL: Final = ("fu", "fv", "pu", "pv")
 _RADTAN: Final = ("k1", "k2", "p1", "p2")
@@ -120,13 +119,12 @@ def parse_chain(
         if has_rig_frame and frame == "imu":
             mounted = [MountedCamera(model, poses[key]) for model, key in zip(models, (low, up), strict=True)]
             rig = Rig(mounted[0], mounted[1], topics=topics)
-            x, y, z = rig.upper.viewpoint - rig.lower.viewpoint
-            lean_rad = np.arctan2(np.hypot(x, y), z)
-            if lean_rad > MAX_LEAN_RAD:
+            z = (rig.upper.viewpoint - rig.lower.viewpoint)[2] / rig.baseline_m
+            if z < MAX_LEAN:
                 warn_of_file(
                     "expected the upper camera along z of the IMU, whose axes become those of the rig, found it "
-                    f"{np.rad2deg(lean_rad):.0f} deg off: give --frame cameras, by which the rig frame follows from "
-                    "the cameras, or add T_base_rig to the rig"
+                    f"{np.rad2deg(np.arccos(z)):.0f} deg off: give --frame cameras, by which the rig frame follows "
+                    "from the cameras, or add T_base_rig to the rig"
                 )
         else:
             rig = rig_between(models[0], models[1], poses[low] @ se3.inverse(poses[up]), topics)

@@ -34,17 +34,11 @@ SECTOR_GRID = 10 * SECTOR_STEPS
 MIN_UNSEEN_RAD = math.radians(45)
 # Least elevations that both cameras see, because 15 degrees have 60 rows at scale 1, four windows of the tracker.
 MIN_SHARED_DEG = 15.0
-# Least length of the horizon, a full turn, of a camera that sees it.
-MIN_HORIZON_PX = 64
-# Steps along the horizon are about as long as each other, because a longer one leads from one end of the image to the
-# other.
-MAX_STEP_RATIO = 20
 # Columns: more than cv2.remap's 32767 with padding cannot be used. Pixels: tables and images must fit the memory.
 MAX_WIDTH_PX, MAX_PIXELS = 16384, 16 * 2**20
-# Rows of a table that are computed at once, because the projection takes some 200 bytes a pixel.
-BLOCK_ROWS = 64
 # Guards against division by zero on the cylinder's axis.
 MIN_RADIUS = 1e-9
+# Rows of a table that are computed at once, because the projection takes some 200 bytes a pixel.
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,14 +230,13 @@ def _turn_px(rig: Rig, right_rad: float, span_rad: float, slope: float) -> float
     with np.errstate(over="ignore", invalid="ignore"):
         around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1) for m in (rig.lower, rig.upper)]
     # At the ends of a sector one of the cameras may have no image, and a stitched image has its ends somewhere on the
-    # horizon: the median step stands for those.
+    # horizon, where a step leads from one end of the image to the other: the median step stands for those.
     usual = [float(np.nanmedian(steps)) if np.isfinite(steps).any() else math.nan for steps in around]
     lengths = [
-        np.where(steps < MAX_STEP_RATIO * step, steps, step).sum() * math.tau / span_rad
+        np.where(steps < 2 * step, steps, step).sum() * math.tau / span_rad
         for steps, step in zip(around, usual, strict=True)
     ]
-    sees_all = np.isfinite(lengths).all() and min(lengths) >= MIN_HORIZON_PX
-    return float(min(lengths)) if sees_all else math.nan
+    return float(min(lengths)) if np.isfinite(lengths).all() and min(lengths) > 0 else math.nan
 
 
 def _project(rig: Rig, mounted: MountedCamera, rays: Array) -> Array:
@@ -260,12 +253,10 @@ def remap_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, pad_px: i
     """
     columns = np.arange(-pad_px, cylinder.width + pad_px)
     u, v = (np.empty((cylinder.height, len(columns)), np.float32) for _ in range(2))
-    for top in range(0, cylinder.height, BLOCK_ROWS):
-        block = np.arange(top, min(top + BLOCK_ROWS, cylinder.height))
-        grid = np.stack(np.meshgrid(columns, block), axis=-1).reshape(-1, 2).astype(float)
-        pixels = _project(rig, mounted, cylinder.rays(grid))
+    for row in range(cylinder.height):
+        pixels = _project(rig, mounted, cylinder.rays(np.column_stack([columns, np.full(len(columns), float(row))])))
         pixels[~inside_image(mounted.camera, pixels)] = -1
-        u[block], v[block] = pixels.T.reshape(2, len(block), -1)
+        u[row], v[row] = pixels.T
     return u, v
 
 

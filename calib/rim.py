@@ -20,9 +20,6 @@ EDGE_PX = 4
 INLIER_PX, MIN_SUPPORT = 2.0, 0.6
 # Least part of the circle that lies in the image, because less does not determine the centre.
 MIN_ARC = 0.4
-# Largest distance of the circle's centre from the guess, as a fraction of the radius: more than the tenth by which a
-# guess may be off.
-MAX_CENTER_SHIFT = 0.25
 # Margin inside the rim and outside the hub, because blur and the last reflections at the edge.
 SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
@@ -40,7 +37,7 @@ def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mas
     if levels is None:
         return None
     edges = _edges(image, center_guess, levels)
-    circle = _fit(edges, center_guess)
+    circle = _fit(edges)
     if circle is None or not _supported(circle, edges, image.shape):
         return None
     u, v, radius = (float(value) for value in circle)
@@ -88,8 +85,8 @@ def _edges(image: NDArray[np.uint8], center: tuple[float, float], levels: tuple[
     return np.column_stack([center[0] + radius_px * np.cos(azimuth), center[1] + radius_px * np.sin(azimuth)])
 
 
-def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
-    """Fit a circle (u, v, radius) to edges (N, 2) in order of azimuth; None if there is none near the guess.
+def _fit(edges: Array) -> Array | None:
+    """Fit a circle (u, v, radius) to edges (N, 2) in order of azimuth; None if they are too few.
 
     The best of the circles through three edges a third of all apart (as RANSAC, without chance), then least squares
     over its inliers as long as they become more.
@@ -103,8 +100,7 @@ def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
     inliers = np.zeros(len(edges), bool)
     while (found := _distance(edges, best) < INLIER_PX).sum() > inliers.sum():
         inliers, best = found, _circle(edges[found])
-    near = np.hypot(best[0] - center[0], best[1] - center[1]) < MAX_CENTER_SHIFT * best[2]
-    return best if near else None
+    return np.asarray(best)
 
 
 def circles_through(points: Array) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from ruamel.yaml import YAML
@@ -23,7 +23,6 @@ from calib.typed_toml import bytes_of, shown
 MAX_FILE_BYTES = 16_000_000
 MAX_SIDE_PX = 32767  # because OpenCV's remap takes no larger images
 MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memory
-MAX_TEXT_BYTES: Final = 1 << 15  # because a camera has about 60 numbers
 # A rotation within this of an orthonormal one is used as it is; others are made orthonormal, up to numbers that are
 # typed with three digits.
 ORTHONORMAL_TOLERANCE, TYPED_TOLERANCE = 1e-9, 1e-3
@@ -39,7 +38,7 @@ def read_bytes(path: str | PathLike[str], limit: int = MAX_FILE_BYTES) -> bytes:
 def read_text(path: str | PathLike[str]) -> str:
     """Read a calibration file of UTF-8 text."""
     with within(f"{path}: "):
-        return read_bytes(path, MAX_TEXT_BYTES).decode("utf-8-sig")
+        return read_bytes(path).decode("utf-8-sig")
 
 
 def require_image_size(key: str, width: float, height: float) -> None:

@@ -30,8 +30,6 @@ View = Literal["mirror", "direct"]
 # The tangential and the astigmatic terms, as files and results name them.
 TANGENTIAL_NAMES, ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
 
-# The limit of the toolbox's own C reader.
-MAX_COEFFICIENTS = 64
 # Size of the table of radii in which the inversion starts, so that each solution stays within one interval.
 TABLE_SIZE = 1025
 # A camera with a wavefront is exact for points at this distance; half of it and twice as far have the same error.
@@ -62,8 +60,7 @@ class OcamCamera:
         with np.errstate(all="ignore"):
             values.append(float(self.height(np.hypot(*self.size))) if self.polynomial else np.nan)
         if not (
-            len(self.polynomial) <= MAX_COEFFICIENTS
-            and np.isfinite(values).all()
+            np.isfinite(values).all()
             and self.polynomial[0] < 0
             and c != d * e
             and min(self.size) > 0
@@ -71,7 +68,7 @@ class OcamCamera:
             and np.abs(self.wavefront).max() <= wavefronts.MAX_COEFFICIENT_M
         ):
             raise CalibError(
-                f"ocam camera: expected 1 to {MAX_COEFFICIENTS} finite coefficients with a0 < 0, an invertible affine, "
+                f"ocam camera: expected finite coefficients with a0 < 0, an invertible affine, "
                 f"a size, distance_m above 0, and a wavefront below {wavefronts.MAX_COEFFICIENT_M} m, found a0 "
                 f"{self.polynomial[:1]}, affine {self.affine}, size {self.size}, {self.distance_m} m, {self.wavefront}"
             )

@@ -8,7 +8,7 @@ look so, too. As the base turns each heading shows another part of the world the
 headings whose normalised textures (core/obstacles/plane_view.py) have the mean m and the standard deviation s, a pixel
 is fixed where
 
-    m sqrt(n) / s > T_0   and   m > m_0.
+    m sqrt(n) / max(s, 1) > T_0.
 
 Headings count, and not places, as lines along a corridor stay where they are while a base drives through it. Only what
 lies well below the horizon is judged: the horizon itself, and walls far away, are where they are at all headings. A
@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.panorama import Cylinder, remap_tables
+from calib.panorama import Cylinder
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras, LogReader
@@ -49,15 +49,13 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-LEANING_SIGMAS: Final = 3.0  # Smaller tilts are not written, because they may be errors of the estimate.
-
 
 @dataclass(frozen=True, slots=True)
 class HeightCalibration:
     """The floor below a rig, and the rig with it."""
 
     before: Rig
-    rig: Rig  # T_base_rig with the height, and with the tilt where it is more than the noise; the base is on the floor
+    rig: Rig  # T_base_rig with the height and the tilt; the base is on the floor
     floor: Floor
     pairs: int
 
@@ -102,29 +100,21 @@ def calibrate_height(
 
 
 def on_floor(rig: Rig, floor: Floor) -> Rig:
-    """Return the rig with its base on the floor, levelled where the tilt is more than its noise."""
-    if floor.tilt_rad < LEANING_SIGMAS * floor.sigma_rad:
-        floor = floor._replace(a=0.0, b=0.0)
+    """Return the rig with its base on the floor and level; the tilt is drawn towards 0 by its prior."""
     view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]
     return replace(rig, T_base_rig=floor.T_floor_base(view) @ rig.T_base_rig)
 
 
 HEADINGS: Final = 16  # of a full turn, 22 degrees apart, so that their textures have nothing in common
-# Three quarters of a turn, because after fewer headings more of a cluttered place seems to be fixed (LEAST_RATIO).
-LEAST_HEADINGS: Final = 12
+LEAST_HEADINGS: Final = 12  # because after fewer headings more of a cluttered place seems to be fixed
 # Least ratio of the mean and its standard error, because in a drive through clutter (872) 0.02 % of the pixels are
-# above it after 12 headings, 0.08 % after 8, and borders of a lens have 10 to 60.
+# above it after 12 headings, and borders of a lens have 10 to 60.
 LEAST_RATIO: Final = 6.0
-LEAST_MEAN: Final = 1.5  # sigmas of the noise, because weaker parts are no evidence of anything
-LEAST_SIGMA: Final = 0.25  # of textures, because a black lens has none, by which no mean could be judged
-SPECK: Final = np.ones((2, 3), np.uint8)  # smallest part, because noise is narrower
 # The band-pass shows the border of a part, so that what is between two of them belongs to it.
 BETWEEN: Final = np.ones((AROUND_ROWS, 9), np.uint8)
 # Shares of the panorama that may be fixed, because less is noise, and where more is images do not follow the heading.
 LEAST, MOST = 0.01, 0.3
 LEAST_FALL: Final = math.tan(math.radians(20))  # below the horizon, because floor there is within 2.5 m of a base
-# Pixels of a panorama are up to some pixels of an image apart: what is between those of a part belongs to it.
-WITHIN: Final = np.ones((7, 7), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,11 +175,11 @@ def _masked(place: Geometry, mounted: MountedCamera, pixels: Flags) -> MountedCa
     if not pixels.any():
         return mounted
     width, height = mounted.camera.size
-    u, v = (np.rint(table[pixels]).astype(int) for table in remap_tables(place.rig, mounted, place.cylinder))
-    shown = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    hidden = np.zeros((height, width), np.uint8)
-    hidden[v[shown], u[shown]] = 255
-    hidden = np.asarray(cv2.morphologyEx(hidden, cv2.MORPH_CLOSE, WITHIN), np.uint8)
+    v, u = np.indices((height, width))
+    rays = mounted.camera.lift(np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    at = place.cylinder.pixels(rays @ (se3.R_of(place.rig.T_rect_rig) @ se3.R_of(mounted.T_cam_rig).T).T)
+    columns, rows = np.nan_to_num(at, nan=-1.0).astype(np.float32).T.reshape(2, height, width)
+    hidden = cv2.remap(pixels.view(np.uint8), columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
     before = mounted.visible
     image = np.full((height, width), 255, np.uint8) if before.image is None else before.image
     return replace(mounted, mask=replace(before, image=np.where(hidden > 0, np.uint8(0), image)))
@@ -225,11 +215,11 @@ class FixedParts:
     def pixels(self) -> Flags:
         """Return the pixels (H, W) that show the same at all headings in either panorama."""
         views = np.stack(list(self._views.values()))
-        mean, variance = views.mean(axis=0), np.maximum(views.var(axis=0, ddof=1), LEAST_SIGMA**2)
-        same = (np.abs(mean) > LEAST_MEAN) & (mean * mean * len(views) > LEAST_RATIO**2 * variance)
-        found = same.any(axis=0).view(np.uint8)
+        # Textures are in units of their noise, of which a black lens shows less.
+        mean, variance = views.mean(axis=0), np.maximum(views.var(axis=0, ddof=1), 1.0)
+        found = (mean * mean * len(views) > LEAST_RATIO**2 * variance).any(axis=0).view(np.uint8)
         found[: max(0, self._first_row)] = 0
-        whole = cv2.morphologyEx(cv2.morphologyEx(found, cv2.MORPH_OPEN, SPECK), cv2.MORPH_CLOSE, BETWEEN)
+        whole = cv2.morphologyEx(found, cv2.MORPH_CLOSE, BETWEEN)
         pixels = np.asarray(cv2.resize(whole, self._shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
         return pixels if LEAST <= pixels.mean() <= MOST else np.zeros(self._shape, bool)
 

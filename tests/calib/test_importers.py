@@ -102,8 +102,8 @@ def test_the_lower_camera_is_known_by_name_topic_or_height() -> None:
 @pytest.mark.parametrize(
     ("R_imu_rig", "off"),
     [
-        (se3.rotation_exp(np.array([0.5, 0.0, 0.0])), ""),  # 29 degrees
-        (se3.rotation_exp(np.array([0.0, 0.55, 0.0])), "32 deg off"),
+        (se3.rotation_exp(np.array([0.75, 0.0, 0.0])), ""),  # 43 degrees
+        (se3.rotation_exp(np.array([0.0, 0.85, 0.0])), "49 deg off"),
         (np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "90 deg off"),  # z forward
     ],
 )
