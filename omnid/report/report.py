@@ -12,16 +12,13 @@ import cv2
 import numpy as np
 
 from calib import se3
-from omnid.config import Config
-from omnid.errors import OmnidError
 from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
 from omnid.formats.tum import Trajectory
-from omnid.plain_text import MOST_ENTRIES, plain, utc
+from omnid.plain_text import MOST_ENTRIES, utc
 from omnid.recordings.evaluation import associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.page import Array, Curve, chart, colours, embedded, facts, grid, note, page, style_and_script, table
 from omnid.report.recorded_run import LEVELS, STATES, UNKNOWN, Event, RecordedRun
-from omnid.settings import changed, parse, value_at
 from omnid.transport import status_names
 from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, STAGE_PREFIX, WORK, Key, short_name, time_key
 from omnid.version import __version__
@@ -46,7 +43,6 @@ def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
         *(() if (run.ranks != UNKNOWN).any() else [note("The log does not hold the state of the odometry.")]),
         *_events_table(events, end_s),
         *(f"<h2>{title}</h2>{''.join(section)}" for title, section in _sections(run, true)),
-        *_settings(run),
         f"<p><small>Made by omnid {__version__}.</small></p></main>",
     ]
     style, script = style_and_script()
@@ -229,18 +225,3 @@ def _words(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table of texts of the log."""
     cells = [[escape(cell) for cell in row] for row in rows]
     return f"<div class='words scroll'>{table(titles, cells)}</div>"
-
-
-def _settings(run: RecordedRun) -> list[str]:
-    """Return the section with the settings that are not at their defaults."""
-    head, text = "<h2>Settings</h2>", run.attachments.get("omnid.toml")
-    if text is None:
-        return [head, note("No settings are attached.")]
-    try:
-        config = parse(Config, text, origin="omnid.toml")
-    except OmnidError:
-        return [head, note("The attached settings are those of another version, or damaged.")]
-    rows = [(path, plain(str(value_at(config, path)), 120), str(value_at(Config(), path))) for path in changed(config)]
-    if not rows:
-        return [head, "<p>All settings are at their defaults.</p>"]
-    return [head, _words(("setting", "value", "default"), rows)]

@@ -62,7 +62,6 @@ def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.Capture
         "Standard deviation",
         "lost here",
         "of the map's 500 points",
-        "No settings are attached",
     ):
         assert words in html, words
     images = [attributes["src"] or "" for tag, attributes in page.tags if tag == "img"]
