@@ -135,12 +135,8 @@ def central_differences(function: Callable[[Array], Array], steps: Array) -> Arr
 
 # Ratio of the standard deviation to the median absolute deviation of a normal distribution.
 SIGMA_PER_MAD = 1.4826
-# Least standard deviation assumed for a coordinate, because exact pixels would make the width of a robust function 0.
-MIN_SIGMA_PX = 0.01
-# Residual of a point that a model cannot project: larger than any residual in an image.
-LOST_PX = 300.0
 
 
 def robust_sigma(residual: Array) -> float:
-    """Return the standard deviation [px] of residuals (NaN: none) by their median size, MIN_SIGMA_PX at least."""
-    return max(MIN_SIGMA_PX, SIGMA_PER_MAD * float(np.nanmedian(np.abs(residual))))
+    """Return the standard deviation [px] of residuals (NaN: none) by their median size; above 0 for exact ones."""
+    return max(BEST_STEP, SIGMA_PER_MAD * float(np.nanmedian(np.abs(residual))))

@@ -13,16 +13,10 @@ from calib.fit.parameters import moved_rig
 from calib.models.camera import Array
 from calib.rig import Rig, RigCovariance
 
-# Step of numeric derivatives by parameters [sigmas]: small against the curvature of a projection, large against its
-# rounding.
-SIGMA_STEP = 0.1
 # The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r.
 WALLS_M, SLOPES, AZIMUTHS = (1.2, 2.0, 4.0), np.linspace(-0.9, 0.6, 11), 16
-# Length [m] and turn [rad] of the predicted motions, short against WALLS_M, and the directions of a drive: the walls
-# are the same all around, so that few are enough.
-MOTION, DIRECTIONS = 0.1, 4
-# Least number of points that both cameras must see.
-MIN_POINTS = 30
+# Length [m] and turn [rad] of the predicted motions, short against WALLS_M.
+MOTION = 0.1
 # A rig whose file states no covariance may be wrong by this: the turn of one camera against the other, and the part of
 # the baseline, which is that of all lengths.
 UNSTATED_TURN_RAD, UNSTATED_SCALE = math.radians(0.05), 0.002
@@ -35,16 +29,6 @@ class DriveUncertainty:
     scale: float
     heading_rad_m: float
 
-    @property
-    def length_part(self) -> float:
-        """Return the part of its length by which a drive may be wrong, in 1 of 20 cases more (two sigmas)."""
-        return 2 * self.scale
-
-    @property
-    def heading_deg_m(self) -> float:
-        """Return the heading by which a drive may be wrong after each metre [degree], in 1 of 20 cases more."""
-        return 2 * float(np.rad2deg(self.heading_rad_m))
-
     def __str__(self) -> str:
         heading_deg_m = float(np.rad2deg(self.heading_rad_m))
         return f"scale uncertain by {100 * self.scale:.2g} %, heading by {heading_deg_m:.2g} degree/m (one sigma)"
@@ -54,18 +38,16 @@ def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
     """Predict the errors of a drive by the covariance of its rig; None if it has none or sees too little.
 
     A drive among walls: points are triangulated by both cameras at its start, then the pose at its end is fitted to
-    their pixels in both cameras, all to first order. Errors are root mean squares over the directions of the drive.
+    their pixels in both cameras, all to first order. Errors are root mean squares of drives along x and along y.
     """
-    if rig.covariance is None or len(seen_points(rig)) < 2 * MIN_POINTS:
+    if rig.covariance is None:
         return None
     J = motion_errors(rig).at(WALLS_M[1])
-    variances = np.zeros(2)
-    for azimuth in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
-        direction = np.array([np.cos(azimuth), np.sin(azimuth)])
-        along = np.einsum("idk,d->ik", J[:, :2], direction)  # errors (6, K) of a motion along the direction
-        variances += np.array([((direction @ along[:2]) ** 2).sum(), (along[5] ** 2).sum()]) / DIRECTIONS
-    scale, heading_rad_m = np.sqrt(variances).tolist()
-    return DriveUncertainty(scale, heading_rad_m)
+    scale, heading_rad_m = (
+        float(np.linalg.norm([J[of, axis] for axis, of in enumerate(rows)])) / math.sqrt(2)
+        for rows in ((0, 1), (-1, -1))
+    )
+    return DriveUncertainty(scale, heading_rad_m) if scale else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +124,6 @@ def _motion_by_parameters(
     end, by the same pixels' equations: J_point dX + J_pose dp + J_parameter = 0, in least squares.
     """
     T_rig_rect = se3.inverse(rig.T_rect_rig)
-    if len(points) < MIN_POINTS:
-        return None
     T_end_start = se3.inverse(se3.exp(motion))
     ends = se3.apply(T_end_start, points)
     first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
@@ -152,7 +132,7 @@ def _motion_by_parameters(
         for at in (points, ends)
     )
     seen = np.all([np.isfinite(part).all(axis=(1, 2)) for part in (first, last, by_start, by_end)], axis=0)
-    if seen.sum() < MIN_POINTS:
+    if seen.sum() < len(motion):
         return None
     first, last, by_start, by_end, ends = (part[seen] for part in (first, last, by_start, by_end, ends))
     shift = -se3.R_of(T_end_start) @ np.linalg.pinv(by_start) @ first  # (N, 3, P), in the axes of the end
@@ -172,4 +152,4 @@ def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...]
             [mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig)) for mounted in (changed.lower, changed.upper)]
         )
 
-    return central_differences(pixels, SIGMA_STEP * np.ones(len(names)))
+    return central_differences(pixels, np.ones(len(names)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -13,7 +12,6 @@ from calib import se3
 from calib.atomic_file import write_file
 from calib.boards.board import AnyBoard, AprilGrid, Board, BoardView
 from calib.fit.boards.rig_fit import SIDES, PairView, RigCalibration, calibrate_boards, rig_covariance
-from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.models.names import sees_directly
 from calib.models.ocam import View
@@ -28,11 +26,11 @@ from omnid.calibration.board_search import (
     view_of_tags,
 )
 from omnid.calibration.images import PairedImages, brightest, read_pairs
-from omnid.calibration.rig_report import AngleRow, angle_lines, angle_rows, rig_report_html
+from omnid.calibration.rig_report import Row, angle_lines, angle_rows, rig_report_html
 from omnid.errors import OmnidError
 
-# Relative difference from the baseline by ruler. A tenth is no error of a ruler; 2 % are 4 mm of 200 mm.
-REFUSED_PART, WARNING_PART = 0.1, 0.02
+# Relative difference from the baseline by ruler that is no error of a ruler.
+REFUSED_PART = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,25 +40,14 @@ class RigResult:
     rig: Rig
     calibration: RigCalibration
     images: PairedImages
-    notes: tuple[str, ...]  # about repeated images, baseline, order of the cameras, and masks that are missing
+    notes: tuple[str, ...]  # about repeated images, order of the cameras, and masks that are missing
     drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras see too little in common
-    angles: tuple[tuple[AngleRow, ...], ...]  # residuals and coverage of the lower and the upper camera
-
-    @property
-    def is_misfit(self) -> bool:
-        """True if a camera model leaves more than noise, and drives may be wrong by MISFIT_PART because of it."""
-        costly = self.drives is None or self.drives.length_part >= MISFIT_PART
-        return costly and any(self.calibration.structure(side).is_misfit for side in range(len(SIDES)))
+    angles: tuple[tuple[Row, ...], ...]  # residuals of the lower and the upper camera
 
     @property
     def warnings(self) -> list[str]:
         """Limits of the result, one line each."""
-        found = self.calibration
-        return [
-            *accuracy_warnings([found.structure(side) for side in range(len(SIDES))], self.drives),
-            *self.notes,
-            *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),
-        ]
+        return [*self.notes, *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected)]
 
     def __str__(self) -> str:
         found = self.calibration
@@ -68,12 +55,11 @@ class RigResult:
         sigma_deg = np.rad2deg(np.linalg.norm(found.motion_sigma[3:]))
         single_views = len(found.views) - found.pairs
         return (
-            f"{'MISFIT: ' if self.is_misfit else ''}baseline {found.baseline_m * 1e3:.2f} mm (sigma "
+            f"baseline {found.baseline_m * 1e3:.2f} mm (sigma "
             f"{found.baseline_sigma_m * 1e3:.2f}), upper rotated by {rotation_deg:.3f} deg (sigma {sigma_deg:.3f}),"
             f" mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs"
             + (f", {single_views} views of one camera alone" if single_views else "")
             + (f"; drives: {self.drives}" if self.drives else "")
-            + (f", good for {GOOD_PART:.1%} of length" if self.drives and self.drives.length_part <= GOOD_PART else "")
         )
 
     @property
@@ -124,22 +110,22 @@ def calibrate_rig(
     sizes = [next(iter(side.values())).shape[::-1] for side in images.sides]
     found = calibrate_boards(views, board, [(w, h) for w, h in sizes], view or "mirror", images.sides, progress)
     # 5. Compare the baseline with what it can be.
-    baseline_notes = _check_baseline(found, board, expected_baseline_m)
+    if expected_baseline_m is not None:
+        _check_baseline(found, board, expected_baseline_m)
     # 6. Build the rig with masks and covariance, and predict the errors of drives.
     rig, unmasked = _masked_rig(found, images)
     rig = replace(rig, covariance=rig_covariance(found, rig))
-    angles = tuple(tuple(angle_rows(found, rig, side)) for side in range(len(SIDES)))
-    notes = (*images.notes, *baseline_notes, *mounting_notes(rig), *unmasked)
+    angles = tuple(tuple(angle_rows(found, side)) for side in range(len(SIDES)))
+    notes = (*images.notes, *mounting_notes(rig), *unmasked)
     return RigResult(rig, found, images, notes, drive_uncertainty(rig), angles)
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
     """Find the board in the images of both cameras."""
-    of_log = bool(images.topics[0])
     found = list[dict[str, BoardView]]()
     for name, side in zip(SIDES, images.sides, strict=True):
         try:
-            views = find_boards(side, board, thorough=not of_log, progress=progress)
+            views = find_boards(side, board, progress)
         except OmnidError as error:
             raise OmnidError(f"{name} camera: {error}") from error
         found.append({view.name: view for view in views})
@@ -147,25 +133,15 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> li
     return [view for view in seen if any(view.seen)]
 
 
-def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | None) -> list[str]:
-    """Return warnings about the baseline; raises OmnidError if it is far from the expected one."""
-    baseline_mm = found.baseline_m * 1e3
-    option, length_mm = (
-        ("--tag-mm", board.tag_m * 1e3) if isinstance(board, AprilGrid) else ("--square-mm", board.square_m * 1e3)
-    )
-    if expected_m is None:
-        return []
-    expected_mm = expected_m * 1e3
-    off = baseline_mm / expected_mm - 1
-    if abs(off) > REFUSED_PART:
+def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float) -> None:
+    """Raise OmnidError if the baseline is far from the expected one."""
+    if abs(found.baseline_m / expected_m - 1) > REFUSED_PART:
+        length_mm = 1e3 * (board.tag_m if isinstance(board, AprilGrid) else board.square_m)
         raise OmnidError(
-            f"calibrate rig: expected a baseline of {expected_mm:g} mm, found {baseline_mm:.1f} mm; "
-            f"{option} {length_mm * expected_mm / baseline_mm:.2f} would explain it: measure the board "
-            f"({option} is {length_mm:g}) and the distance of the mirrors"
+            f"calibrate rig: expected a baseline of {1e3 * expected_m:g} mm, found {1e3 * found.baseline_m:.1f} mm; "
+            f"squares or tags of {length_mm * expected_m / found.baseline_m:.2f} mm would explain it: measure the "
+            f"board ({length_mm:g} mm are given) and the distance of the mirrors"
         )
-    if abs(off) > WARNING_PART:
-        return [f"the baseline of {baseline_mm:.2f} mm is {abs(off):.1%} off the expected {expected_mm:g} mm"]
-    return []
 
 
 def _masked_rig(found: RigCalibration, images: PairedImages) -> tuple[Rig, list[str]]:
@@ -181,33 +157,3 @@ def _masked_rig(found: RigCalibration, images: PairedImages) -> tuple[Rig, list[
                 f"add [{name}.mask] by hand"
             )
     return replace(rig, lower=mounted[0], upper=mounted[1]), warnings
-
-
-# Relative error of a drive's length. Up to GOOD_PART there is no warning. From MISFIT_PART on the warning advises
-# against the rig: that is a third of the error of wheels, about a per cent, which the cameras are to improve on.
-MISFIT_PART, GOOD_PART = 0.003, 0.001
-
-
-def accuracy_warnings(structures: Sequence[ResidualStructure], drives: DriveUncertainty | None) -> list[str]:
-    """Return the warnings, none for a rig that is accurate enough.
-
-    A camera whose residuals are more than noise has a line; where both have noise only, one line asks for more pairs.
-    structures: those of the residuals of the lower and the upper camera. drives: the error of drives that follows from
-    the rig's covariance; None: it is not known.
-    """
-    misfits = [
-        f"{name} camera: the camera model does not describe this camera: {structure}"
-        for name, structure in zip(SIDES, structures, strict=True)
-        if structure.is_misfit
-    ]
-    if drives is None:
-        return [f"{line}; do not use it where accuracy matters" for line in misfits]
-    if drives.length_part <= GOOD_PART:
-        return []
-    cost = (
-        f"drives may be wrong by {100 * drives.length_part:.2g} % of their length and by {drives.heading_deg_m:.2g} "
-        "degree of heading per metre (two sigmas)"
-    )
-    advice = ": do not use it where that matters" if drives.length_part >= MISFIT_PART else ""
-    lines = [f"{line}; {cost}{advice}" for line in misfits]
-    return lines or [f"the images leave something open: {cost}; add pairs where the tables say `no board`"]

@@ -16,7 +16,6 @@ from omnid.calibration.images import Image, brightest, middle_px
 from omnid.core.stereo.tiles import SATURATED_GREY
 
 IMAGES: Final = 10  # Images of each camera: the rim is searched in their maximum.
-NOISE_GREY2: Final = 4.0  # of the variance of the grey levels: an image without any content has no focus
 GREEN, RED = (80, 220, 80), (60, 60, 230)
 
 
@@ -43,7 +42,7 @@ def view_of(images: Sequence[Image]) -> CameraView:
     if not world.any():
         return CameraView(newest, rim, math.nan, math.nan, math.nan)
     grey = newest[world]
-    focus = float(cv2.Laplacian(smooth, cv2.CV_32F)[world].var() / (grey.var() + NOISE_GREY2))
+    focus = float(cv2.Laplacian(smooth, cv2.CV_32F)[world].var() / max(1.0, grey.var()))
     return CameraView(newest, rim, focus, float(grey.mean()), float((grey >= SATURATED_GREY).mean()))
 
 

@@ -195,11 +195,9 @@ def drive(args: argparse.Namespace) -> int:
         has_drifted = checked.finding.state is not RigState.FITS
     elif not args.only:
         adjusted = calibrate_drive(args.logs, rig, topics, lambda line: print(line, file=sys.stderr))
-        print("\n".join(adjusted.lines()))
+        print(adjusted)
         if not adjusted.is_better:
             print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
-        elif adjusted.is_misfit:
-            options.warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
         rig = adjusted.rig if adjusted.is_better else rig
     # 3. Find the height, and the masks; a log that shows none of them is no error but for --only.
     rig = _at_height(args, rig)

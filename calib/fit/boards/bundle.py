@@ -34,7 +34,6 @@ from calib.fit.least_squares import (
     BEST_STEP,
     DAMPING_FACTOR,
     KERNEL_WIDTH,
-    LOST_PX,
     ROUNDS,
     START_DAMPING,
     ArrowSystem,
@@ -116,7 +115,7 @@ class BoardRig:
     def residuals(self, pixels: Array, drawn: Array) -> Array:
         """Return measured minus modelled pixels (K, C, N, 2) of the corners drawn (N, 3) of the board.
 
-        NaN without a measurement, LOST_PX without a projection.
+        NaN without a measurement, the image's diagonal without a projection.
         """
         points = self.shape.points(drawn)
         cast = [
@@ -124,7 +123,7 @@ class BoardRig:
             for camera, T in zip(self.cameras, self.transforms(), strict=True)
         ]
         off = pixels - np.stack(cast, axis=1)
-        return np.where(np.isnan(off) & np.isfinite(pixels), LOST_PX, off)
+        return np.where(np.isnan(off) & np.isfinite(pixels), np.hypot(*self.cameras[0].size), off)
 
 
 @dataclass(frozen=True, slots=True)
@@ -439,23 +438,17 @@ def smooth_fields(pixels: Array, cameras: int) -> Array:
     Rows of unknown pixels (NaN) are 0. The sum of all fields has about unit size.
     """
     K, N, _ = pixels.shape
-    own, width = [], 2 / (NODES - 1)
-    for part in np.split(pixels, cameras, axis=1):
+    line, width = np.linspace(-1, 1, NODES), 2 / (NODES - 1)
+    nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    fields = np.zeros((K, cameras, N // cameras, 2, cameras, len(nodes)))
+    for camera, part in enumerate(np.split(pixels, cameras, axis=1)):
         known = part[np.isfinite(part).all(axis=2)]
         center = known.mean(axis=0)
         radius = float(np.linalg.norm(known - center, axis=1).max())
-        line = np.linspace(-1, 1, NODES)
-        nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
         away = ((part[:, :, None] - center) / radius - nodes) / width
         gaussian = np.exp(-0.5 * (away**2).sum(axis=3, keepdims=True))
-        own.append(np.nan_to_num(-away * gaussian).swapaxes(2, 3))
-    counts = [each.shape[3] for each in own]
-    fields = np.zeros((K, N, 2, sum(counts)))
-    first, size = 0, N // cameras
-    for camera, values in enumerate(own):
-        fields[:, camera * size : (camera + 1) * size, :, first : first + counts[camera]] = values
-        first += counts[camera]
-    return fields
+        fields[:, camera, :, :, camera] = np.nan_to_num(-away * gaussian).swapaxes(2, 3)
+    return fields.reshape(K, N, 2, -1)
 
 
 def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, variance: float) -> Array:

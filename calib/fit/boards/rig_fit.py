@@ -17,19 +17,15 @@ from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
 from calib.fit.boards.start import LinearCamera, initialise_relative_pose, solve_linear
 from calib.fit.least_squares import BEST_STEP, central_differences
-from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
 from calib.rig import TRANSFORM_NAMES, Rig, RigCovariance
 
 # With four views the median of their errors still shows which one is wrong; fewer are not enough for that.
 MIN_VIEWS: Final = 4
-# A view is an outlier if its median error exceeds this ratio of the views' median, and this error in pixels: with exact
-# corners the ratio alone would reject views for differences of no importance.
-BAD_RATIO, BAD_PX = 3.0, 0.25
-# The same for the mean ray error of the linear solution, which is larger because that solution has no affine terms and
-# its centre is that of a grid search.
-BAD_LINEAR_RATIO, BAD_LINEAR_RAD = 5.0, 0.01
+# A view is an outlier if its error exceeds this ratio of the views' median, and this error in pixels, or rays of the
+# linear solution: with exact corners the ratio alone would reject views for differences of no importance.
+BAD_RATIO, BAD_PX, BAD_RAD = 4.0, 0.25, 0.01
 # Larger mean errors mean that the images do not show one board at one time: right ones have 0.05 to 0.15 px.
 MAX_MEAN_PX: Final = 3.0
 SIDES: Final = ("lower", "upper")
@@ -104,11 +100,6 @@ class RigCalibration:
     def pairs(self) -> int:
         """Return the number of instants at which all cameras saw the board."""
         return _pairs(self.views)
-
-    def structure(self, side: int) -> ResidualStructure:
-        """Return the structure of the lower (0) or upper (1) camera's residuals."""
-        pixels, residuals = _pixels(self.views, self.board)[:, side], self.fit.residuals[:, side]
-        return residual_structure(pixels.reshape(-1, 2), residuals.reshape(-1, 2), self.cameras[side].center)
 
 
 def calibrate_boards(
@@ -187,7 +178,7 @@ def consistent_views(
         _require(len(good), "consistent views", rejected)
         solved = solve_linear(_pixels(good, board)[:, 0], board.points, size, view)
         worst, usual = int(np.argmax(solved.errors_rad)), float(np.median(solved.errors_rad))
-        if solved.errors_rad[worst] <= max(BAD_LINEAR_RATIO * min(usual, BAD_LINEAR_RAD), BAD_LINEAR_RAD):
+        if solved.errors_rad[worst] <= max(BAD_RATIO * min(usual, BAD_RAD), BAD_RAD):
             return good, rejected, solved
         reason = (
             f"its corners lie {np.rad2deg(solved.errors_rad[worst]):.1f} deg or more off any board, the others "

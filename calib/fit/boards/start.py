@@ -132,8 +132,6 @@ def _eliminate_depths(
 # Distance of two transforms: angle [rad] plus shift relative to the baseline. A pair is an inlier below INLIER_RATIO
 # times the median distance, within these limits.
 MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE, INLIER_RATIO = 0.06, 0.3, 5.0
-# The order of corners is ambiguous if a transform farther away than any inlier costs less than this ratio.
-MIN_COST_RATIO = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +206,8 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
     cost = np.minimum(nearest, MAX_INLIER_DISTANCE).mean(axis=1)
     best = int(cost.argmin())
     others = cost[apart[best].ravel() > MAX_INLIER_DISTANCE]
-    if candidates.shape[1] > 1 and others.size and others.min() < max(MIN_COST_RATIO * cost[best], MIN_INLIER_DISTANCE):
+    # The order of corners is ambiguous if a transform farther away than any inlier fits nearly as well.
+    if candidates.shape[1] > 1 and others.size and others.min() < max(INLIER_RATIO * cost[best], MIN_INLIER_DISTANCE):
         raise CalibError(
             "calibrate rig: a board with two even or two odd sides looks the same upside down, and its orientation is "
             "ambiguous in these pairs; hold it at more places, or use a board with one odd and one even side"
