@@ -20,8 +20,6 @@ from calib.models.camera import Array
 # The terms a, b, c_x, c_y, s, as files and results name them.
 WAVEFRONT_NAMES = ("w_a", "w_b", "w_x", "w_y", "w_s")
 TERMS = len(WAVEFRONT_NAMES)
-# Largest coefficient [m], because a wavefront of larger ones is no small error of a mirror.
-MAX_COEFFICIENT_M = 0.1
 # Iterations of the direction, because each reduces its error by the offset as a fraction of the distance, 1 / 1000.
 STEPS = 4
 # Least 1 + z, at which directions opposite to the axis are held: guards against division by zero.
