@@ -45,12 +45,11 @@ START_SPEED_SIGMA = 1.0  # m/s and rad/s, of a motion that is not known yet
 UNKNOWN_SPEED_SIGMA = 0.5
 SLOWING_S = 0.3  # time constant of the predicted velocity's decay meanwhile
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # of a pose, m and rad: larger ones would leave no digits to differences
-# Errors of wheels and gyro at the start, their standard deviations, and those of their random walks over one second.
-# After many steps that do not agree the deviations are ten times as large, so that all is learned again.
-START = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
+# Standard deviations of the errors of wheels and gyro at the start, and those of their random walks over one second.
+# After many steps that do not agree the first are ten times as large, so that all is learned again.
 START_SIGMA = np.array([0.05, 0.1, 0.02, 0.02, 0.02])
 WALK_SIGMA = np.array([2e-4, 5e-4, 5e-5, 5e-5, 5e-5])
-STATES_OF: dict[type[MotionSample], slice] = {WheelSample: slice(0, 2), GyroSample: BIAS}
+STATES_OF: dict[type[MotionSample], slice] = {WheelSample: slice(DISTANCE, BIAS.start), GyroSample: BIAS}
 SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales: beyond them their settings are wrong.
 CAMERA_SIGMA = np.repeat([3e-4, 1e-4], 3)  # of the cameras' step, m and rad, in addition to its covariance
 # Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,
@@ -72,7 +71,7 @@ class MotionFilter:
         self._filter = KalmanFilter(dim_x=SIZE, dim_z=6)
         self._filter.H = np.eye(6, SIZE)
         self._filter.x = np.zeros((SIZE, 1))
-        self._filter.x[SENSORS, 0] = START
+        self._filter.x[SENSORS][[DISTANCE, TURN]] = 1.0
         self._filter.P = np.zeros((SIZE, SIZE))
         self._filter.P[SENSORS, SENSORS] = np.diag(START_SIGMA**2)
         self.slips = self.refused = self.steps = 0

@@ -27,8 +27,6 @@ AHEAD, ROLL, YAW = 0, 3, 5  # components of the twist of the base: wheels measur
 # Errors of a step that are independent of those of other steps, by sigma: shares of the wheels' distance and turn for
 # roughness and slack, least errors for the steps of encoders, noise of the gyro over one second.
 WHEEL_SHARES, WHEEL_LEAST, GYRO_RADPS_SQRT_S = (0.02, 0.04), (6e-4, 1e-3), 1e-3
-# Wheels roll forwards on a plane: lateral error as a share of the way and at least, vertical error, roll and pitch.
-SIDE_SHARE, SIDE_M, HEIGHT_M, TILT_RAD = 0.01, 3e-4, 5e-4, 1e-3
 # Sigmas of an acceleration that is not known, m/s^2 and rad/s^2: about half of the most that controller.limits allows
 # by default, 1.5 m/s^2 and 3 rad/s^2.
 ACCELERATION_SIGMAS: Final = (1.0, 2.0)
@@ -178,7 +176,11 @@ class MotionSensors:
 
 
 def on_a_plane(wheels: Twist, states: Array) -> Twist:
-    """Return the twist of a base whose wheels measure a part of it: it rolls forwards on a plane."""
-    aside_m = math.hypot(SIDE_SHARE * wheels[AHEAD].value, SIDE_M) if AHEAD in wheels else SIDE_M
-    sigmas = {1: aside_m, 2: HEIGHT_M, 3: TILT_RAD, 4: TILT_RAD}
+    """Return the twist of a base whose wheels measure a part of it: it rolls forwards on a plane.
+
+    It leaves the plane, and moves to the side, by as much as wheels err.
+    """
+    least_m, least_rad = WHEEL_LEAST
+    aside_m = math.hypot(WHEEL_SHARES[0] * wheels[AHEAD].value, least_m) if AHEAD in wheels else least_m
+    sigmas = {1: aside_m, 2: least_m, ROLL: least_rad, ROLL + 1: least_rad}
     return {axis: Measured(0.0, np.zeros(len(states)), sigma**2) for axis, sigma in sigmas.items()} | wheels
