@@ -60,7 +60,7 @@ class StereoDepth:
     """Evidence of the depth of a pair: `stages.geometry.DenseDepths` computes the dense depth from it."""
 
     panoramas: Panoramas
-    # The motion during the exposures, for which the depth is corrected; None: not known, or all pixels at once.
+    # The motion during the exposures, for which the depth is corrected; None: not known.
     exposure: Exposure | None = None
     # What the camera saw at the last keyframe; None: there was none, or the motion since then is not known well.
     earlier: EarlierView | None = None

@@ -14,7 +14,6 @@ from omnid.core.control.motion_monitor import AGREE, Conflict
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
-from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.odometry import VisualOdometry
@@ -103,7 +102,7 @@ class FrontEnd:
             pair.seq,
             pair.lower,
             pair.upper,
-            lambda exposure: self.dense.points(pair, _moving(exposure)).disparity,
+            lambda exposure: self.dense.points(pair, exposure).disparity,
             np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable,
             pair.times,
             interval_s,
@@ -174,7 +173,7 @@ class FrontEnd:
             self._keyframe = (pair, estimate) if is_known else None
         if before is not None and is_known and before[1].resets == estimate.resets:
             T_earlier_now = se3.inverse(before[1].T_odom_rect) @ T_odom_rect
-            earlier = EarlierView(before[0].lower, before[0].usable, T_earlier_now, _moving(before[1].exposure))
+            earlier = EarlierView(before[0].lower, before[0].usable, T_earlier_now, before[1].exposure)
         return OdometryUpdate(
             pair.seq,
             pair.stamp_ns,
@@ -186,7 +185,7 @@ class FrontEnd:
             estimate.resets,
             estimate.inliers,
             estimate.tracked,
-            StereoDepth(pair, _moving(estimate.exposure), earlier),
+            StereoDepth(pair, estimate.exposure, earlier),
             estimate.features,
             pair.light,
             pair.motion,
@@ -196,8 +195,3 @@ class FrontEnd:
             T_odom_rect,
             covariance_rect,
         )
-
-
-def _moving(exposure: Exposure | None) -> Exposure | None:
-    """Return the exposure of a frame, None where all its pixels are exposed at the stamp."""
-    return None if exposure is None or exposure.times.is_at_once else exposure

@@ -209,8 +209,9 @@ class DenseDepths:
     def points(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
         """Return disparities and their points in the rig frame, as matched, at the stamp of the pair.
 
-        exposure: the motion during the exposures; None: unknown, or none is needed.
+        exposure: the motion during the exposures; None: unknown.
         """
+        exposure = None if exposure is None or exposure.times.is_at_once else exposure
         return self._once(panoramas, exposure, partial(self._computed, panoramas, exposure))
 
     def _once(self, panoramas: Panoramas, key: object, compute: Callable[[], DensePoints]) -> DensePoints:

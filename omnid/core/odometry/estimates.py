@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure, RigVelocity
 from omnid.core.odometry.stereo_frame import Features
-from omnid.errors import OmnidError
 from omnid.tracking_state import TrackingState
 
 
@@ -19,7 +18,7 @@ from omnid.tracking_state import TrackingState
 class OdometryLimits:
     """Number of landmarks and keyframes, and the thresholds of the acceptance test and of the tracking state."""
 
-    features: Annotated[int, Meta(ge=20, le=10_000), "landmarks wanted in a keyframe"] = 500
+    features: Annotated[int, Meta(ge=40, le=10_000), "landmarks wanted in a keyframe"] = 500
     refresh: float = 0.9  # a keyframe is added when less than this share of the last one's landmarks is left
     # Defaults of times lie in the middle between two pairs at 10 Hz, so that the jitter of stamps changes nothing.
     sparse_s: float = 0.45  # time after which a keyframe is added where the features wanted are not reached, s
@@ -45,14 +44,6 @@ class OdometryLimits:
         "nothing, as degraded; 0: never, s",
     ] = 10.0
     bridge_sigma_m: float = 0.15  # uncertainty of the position that ends that, standard deviation
-
-    def __post_init__(self) -> None:
-        """Raise OmnidError unless a keyframe may have more landmarks than a pose needs."""
-        if self.min_inliers >= self.features:
-            raise OmnidError(
-                f"odometry.limits.min_inliers is {self.min_inliers}: expected less than odometry.limits.features, "
-                f"{self.features}, as no pose has more inliers than a keyframe has landmarks"
-            )
 
 
 Array = NDArray[np.float64]
