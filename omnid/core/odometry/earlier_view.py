@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.patch_kernels import correlate
-from omnid.core.odometry.tracking import padded
+from omnid.core.odometry.tracking import normalised_patches
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -58,16 +57,15 @@ def contradicted(
         seen -= earlier.exposure.shift(there).lower
     height, width = earlier.usable.shape
     columns, rows = np.nan_to_num(np.rint(seen)).astype(np.intp).T
-    shown = earlier.usable[np.clip(rows, 0, height - 1), columns % width] & cylinder.shows(seen[:, 0])
-    chosen = np.flatnonzero(shown & (np.abs(seen[:, 1] - height / 2) < height))
+    chosen = earlier.usable[np.clip(rows, 0, height - 1), columns % width] & cylinder.shows(seen[:, 0])
+    for at in (pixels, seen):
+        chosen &= np.abs(at[:, 1] - (height - 1) / 2) <= (height - 1) / 2 - HALF_PX
     # 2. The correlations of both hypotheses there; they are one where the point has not moved in the image.
-    now, there, here = (
-        padded(panorama, at[chosen])
-        for panorama, at in ((lower, pixels), (earlier.lower, seen), (earlier.lower, pixels))
+    here, there = pixels[chosen], seen[chosen]
+    now, _ = normalised_patches(lower, here, 2 * HALF_PX + 1)
+    of_world, of_rig = (
+        (now * normalised_patches(earlier.lower, at, 2 * HALF_PX + 1)[0]).sum(axis=1) for at in (there, here)
     )
-    of_world, of_rig = np.empty((2, len(chosen)))
-    for found, at in ((of_world, there), (of_rig, here)):
-        correlate(lower.image, earlier.lower.image, now, at, HALF_PX, found)
     has_moved = np.hypot(lower.apart(there[:, 0] - here[:, 0]), there[:, 1] - here[:, 1]) > HALF_PX
     wrong = np.zeros(len(points), bool)
     wrong[chosen] = (of_world < LEAST) | (has_moved & (of_rig > of_world))

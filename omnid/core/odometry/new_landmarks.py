@@ -106,12 +106,12 @@ def _repeats(pair: Pair, pixels: Array, own: Array, tried: Flags, own_px: int) -
     # 1. The correlations.
     scores = np.full(tried.shape, -1.0, np.float32)
     compared = (tried | is_own) & tried.any(axis=1, keepdims=True)
-    for disparity in np.flatnonzero(compared.any(axis=0)):
-        chosen = np.flatnonzero(compared[:, disparity])
-        there = np.rint(pixels[chosen] + np.array([0.0, disparity]))
+    for part in np.array_split(np.argwhere(compared), 1 + int(compared.sum()) // len(pixels)):
+        there = np.rint(pixels[part[:, 0]])
+        there[:, 1] += part[:, 1]
         upper, _ = normalised_patches(pair[1], there, SIDE_PX)
         is_inside = there[:, 1] < len(pair[1].image)
-        scores[chosen, disparity] = np.where(is_inside, (lower[chosen] * upper).sum(axis=1), -1.0)
+        scores[tuple(part.T)] = np.where(is_inside, (lower[part[:, 0]] * upper).sum(axis=1), -1.0)
     # 2. The best one near the own disparity, and the best one elsewhere.
     at_own, elsewhere = (np.where(flags, scores, -1.0).max(axis=1) for flags in (is_own, tried))
     return np.asarray(tried.any(axis=1) & (elsewhere > at_own - LEAST_LEAD))

@@ -1,4 +1,4 @@
-"""Compiled part of the patches of planes, see plane_patches.py for the equations and the arguments; correlation."""
+"""Compiled part of the patches of planes, see plane_patches.py for the equations and the arguments."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ Indices = NDArray[np.intp]
 # Enough: 98 % of the patches of test_plane_patches.py end before; a last step is below the hundredths that noise
 # leaves.
 ITERATIONS, CONVERGED_PX = 12, 0.01
-LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # Limits; exposures were made equal before.
+LARGEST_GAIN = 4.0  # and the inverse of the least one; exposures were made equal before
 MIN_CONTRAST = 0.5  # grey levels, standard deviation in a window, because less is no texture
 # Determinant of the gradients' matrix by its squared trace, because less is an edge, along which a patch slides.
 MIN_DETERMINANT = 1e-3
 # Interpolation correlates the noise of neighbouring pixels, so that a sum over a window of a panorama varies by this
 # factor more.
 NOISE_CORRELATION = 3.0
-# Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix.
-GRADIENT_NOISE = 0.12
-FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
+# Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix, and
+# the least share of that matrix that counts as texture.
+GRADIENT_NOISE, MIN_TRUE_GRADIENT = 0.12, 0.2
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
 LANES = 8  # columns that the compiler computes at once
-MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture.
 
 
 @compiled(
@@ -62,8 +61,8 @@ def sample(
     across, down, part = weights[0], weights[1], weights[2]
     columns, rows = np.empty((3, 3)), np.empty((3, 3))
     for n in chosen:
-        # A place that is NaN or absurd has no template.
-        is_near = abs(centres[n, 0]) < FARTHEST_PX and abs(centres[n, 1]) < FARTHEST_PX
+        # A place that is NaN or outside has no template.
+        is_near = 0 <= centres[n, 0] < image.shape[1] and 0 <= centres[n, 1] < image.shape[0]
         if not (is_near and abs(shift[n, 0]) <= 1 and abs(shift[n, 1]) <= 1):
             templates[n] = 0.0
             continue
@@ -262,14 +261,14 @@ def fit(
                 residual -= 2 * right[a] * solution[a]
                 for b in range(size):
                     residual += solution[a] * normal[a, b] * solution[b]
-            gain = min(max(solution[2], LEAST_GAIN), LARGEST_GAIN)
+            gain = min(max(solution[2], 1 / LARGEST_GAIN), LARGEST_GAIN)
             variance = max(residual / pixels, noise)
             step_x, step_y = solution[0] / gain, solution[1] / gain
             x, y = x + min(max(step_x, -1.0), 1.0), y + min(max(step_y, -1.0), 1.0)
             if not (abs(x) < reach_px and abs(y) < reach_px) or max(abs(step_x), abs(step_y)) <= CONVERGED_PX:
                 break
         # 4. The result.
-        fits[n] = abs(x) < reach_px and abs(y) < reach_px and LEAST_GAIN < solution[2] < LARGEST_GAIN
+        fits[n] = abs(x) < reach_px and abs(y) < reach_px and 1 / LARGEST_GAIN < solution[2] < LARGEST_GAIN
         shift[n, 0], shift[n, 1] = x, y
         for a in range(3, size):
             slopes[n, a - 3] = solution[a] / gain
@@ -366,31 +365,3 @@ def write_covariance(inverse: Array, variance: float, pixels: int, covariance: A
     for a in range(2):
         for b in range(2):
             covariance[a, b] = NOISE_CORRELATION * variance / texture * inverse[a, b]
-
-
-@compiled("(u1[:, ::1], u1[:, ::1], f8[:, ::1], f8[:, ::1], i8, f8[::1])", writes=("found",))
-def correlate(a: Image, b: Image, at_a: Array, at_b: Array, half_px: int, found: Array) -> None:
-    """Write the correlations (N,) of windows about whole pixels at_a (N, 2) of a with those about places at_b of b.
-
-    Greys between pixels are interpolated. A window without contrast has none; those that leave an image are NaN.
-    """
-    pixels, reach = float((2 * half_px + 1) ** 2), half_px + 1
-    for n in range(len(found)):
-        column, row = int(at_a[n, 0]), int(at_a[n, 1])
-        left, top = math.floor(at_b[n, 0]), math.floor(at_b[n, 1])
-        found[n] = math.nan
-        if min(column, row, left, top) < reach or max(column, left) >= a.shape[1] - reach:
-            continue
-        if max(row, top) >= a.shape[0] - reach:
-            continue
-        u, v = at_b[n, 0] - left, at_b[n, 1] - top
-        x, xx, y, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0
-        for i in range(-half_px, half_px + 1):
-            for j in range(-half_px, half_px + 1):
-                mine = float(a[row + i, column + j])
-                above, below = b[top + i], b[top + i + 1]
-                there = (1 - v) * ((1 - u) * above[left + j] + u * above[left + j + 1])
-                there += v * ((1 - u) * below[left + j] + u * below[left + j + 1])
-                x, xx, y, yy, xy = x + mine, xx + mine * mine, y + there, yy + there * there, xy + mine * there
-        spread = max(xx - x * x / pixels, 1.0) * max(yy - y * y / pixels, 1.0)
-        found[n] = (xy - x * y / pixels) / math.sqrt(spread)

@@ -13,7 +13,6 @@ Array = NDArray[np.float64]
 Camera = tuple[float, float, float, float, float]
 
 VIEW, POSE, ROTATION = 3, 6, 3  # numbers of a view and of a step, and the first one of its rotation
-LEAST_R_M = 1e-9  # from the axis, so that no division is by zero
 
 
 @compiled(
@@ -79,7 +78,7 @@ def write_view(landmark: Array, seen: Array, T: Array, camera: Camera, J: Array,
     x, y, z = T[0, -1], T[1, -1], T[2, -1]
     for k in range(len(landmark)):
         x, y, z = x + T[0, k] * landmark[k], y + T[1, k] * landmark[k], z + T[2, k] * landmark[k]
-    per_r = 1 / max(math.sqrt(x * x + y * y), LEAST_R_M)
+    per_r = 1 / math.sqrt(x * x + y * y)
     scale = focal * per_r
     column_error = seen[0] - (left - math.atan2(y, x)) * focal + 0.5
     e[0] = column_error - turn_px * math.floor(column_error / turn_px + 0.5)

@@ -5,7 +5,7 @@ Equations and sections are those of Dang et al. 2012.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from calib import se3
 from omnid.core.odometry.corners import REACH_PX
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.local_map import LocalMap, Tracks
+from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import LANDMARKS, displacements
 from omnid.core.odometry.plane_patches import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import (
@@ -39,8 +39,6 @@ MIN_LANDMARKS = 6
 # `struts` 5 at 384 px: in 99 % of the frames the last round ends within 0.02 sigmas of where 50 steps lead, and the
 # coarse one within 0.24.
 COARSE_STEPS, STEPS = (3,), (2, 4)
-# Refinements of a recognised pose: the first one brings most patches into reach, the second one aligns them all.
-RECOGNISED_ROUNDS = 2
 # Standard deviation of a track whose patch was not yet warped to the new viewpoint.
 COARSE_SIGMA_PX = 0.3
 # Cost of a landmark that is no inlier: that of the last one.
@@ -53,23 +51,11 @@ GOOD_RATIO = 0.5
 TRACKED_SHARE = 0.6
 
 
-@dataclass(frozen=True, slots=True)
-class CoarsePose:
-    """Pose from the tracks, and the inliers among them."""
-
-    T_curr_odom: Array  # (4, 4)
-    landmarks: Indices  # (M,) rows of the local map
-    disparity: Array  # (M,) px between the images of this frame, NaN: not found in the upper panorama
-    variance: Array  # (M,) px^2 of the disparity by noise
-    tracks: Tracks
-
-
 class PoseSearch:
     """Finds a frame in the local map."""
 
     def __init__(self, local_map: LocalMap, model: StereoModel, limits: OdometryLimits) -> None:
         self._map, self._model, self._limits = local_map, model, limits
-        self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
         # Number of landmarks that are tracked at most.
         self._tracked = max(2 * limits.good_inliers, round(TRACKED_SHARE * limits.features))
 
@@ -119,7 +105,11 @@ class PoseSearch:
         return [each for each in others if each is not None and each.distance_m(T_predicted) < max(reach_m, off_m)]
 
     def estimate(self, frame: StereoFrame, T_guess: Array, exposure: Exposure, *, is_near: bool) -> PoseEstimate | None:
-        """Return the pose from one guess (4, 4); None where fewer than MIN_LANDMARKS support it."""
+        """Return the pose from one guess (4, 4); None where fewer than MIN_LANDMARKS support it.
+
+        Tracks from the last panorama and patches of the keyframes are two independent supports of the pose: the number
+        of inliers is the smaller one of both.
+        """
         # 1. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
         tracks = self._map.track(frame.lower, T_guess, self._tracked, turn=frame.seq, near=is_near)
         if len(tracks.landmarks) < MIN_LANDMARKS:
@@ -135,81 +125,87 @@ class PoseSearch:
         spread_px = 2 * np.sqrt(shift.variance(exposure.motion)[:, 3])
         pair = frame.lower, frame.upper
         rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, REACH_PX, spread_px)
-        disparity = rows - tracks.pixels[:, 1]
         views = np.column_stack([tracks.pixels, rows]) + np.column_stack([shift.lower, shift.upper[:, 1]])
         # 3. RANSAC on three points (IV.B) and Gauss-Newton on the bearings in both cameras (IV.C, in place of eq. 9).
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
         chosen, noise = np.flatnonzero(is_inlier), shift.noise(exposure.motion)
-        landmarks, views, noise = tracks.landmarks[chosen], views[chosen], noise[chosen]
-        solution, kept = self._solve(landmarks, views, T_curr_guess @ T_guess_odom, self._coarse_model, noise)
+        landmarks, coarse = tracks.landmarks[chosen], replace(self._model, sigma_px=COARSE_SIGMA_PX)
+        solution, kept = self._solve(landmarks, views[chosen], T_curr_guess @ T_guess_odom, coarse, noise[chosen])
         if solution is None:
             return None
         # 4. Align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
-        chosen = chosen[kept]
-        coarse = CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
-        return self.refine(frame, coarse, exposure)
+        chosen, landmarks = chosen[kept], landmarks[kept]
+        disparity, variances = np.full(len(self._map), np.nan), np.zeros(len(self._map))
+        disparity[landmarks], variances[landmarks] = (rows - tracks.pixels[:, 1])[chosen], variance[chosen]
+        estimate = self.refine(frame, solution.T, exposure, disparity, variances)
+        if estimate is None:
+            return None
+        visible, tracked, supporting = (
+            round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(landmarks))
+        )
+        # The share that the upper camera confirms. Where the cameras expose at several times it is 1: an acceleration
+        # that is not known hides rows as well.
+        upper_ratio = float(np.isfinite(rows[chosen]).mean()) if frame.times.is_at_once else 1.0
+        return replace(
+            estimate,
+            visible=visible,
+            tracked=tracked,
+            inliers=min(supporting, estimate.inliers),
+            rejected=tracks.pixels[~np.isin(tracks.landmarks, estimate.landmarks)],
+            upper_ratio=upper_ratio,
+        )
 
-    def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure) -> PoseEstimate | None:
+    def refine(
+        self, frame: StereoFrame, T_curr_odom: Array, exposure: Exposure, disparity: Array, variance: Array
+    ) -> PoseEstimate | None:
         """Return the pose from the keyframes' patches of all landmarks in view; None where too few are aligned.
 
-        The disparity of the tracked landmarks was measured between the images of this frame, so it is kept and goes
-        along with the aligned lower row. Tracks from the last panorama and patches of the keyframes are two independent
-        supports of the pose: the number of inliers is the smaller one of both.
+        disparity, variance (N,) of the map's landmarks [px, px^2]: measured between the images of this frame, so that
+        they go along with the aligned lower row; NaN: unknown.
         """
         # 1. Align the patches of the keyframes in the lower panorama.
-        T_odom_curr = se3.inverse(coarse.T_curr_odom)
+        T_odom_curr = se3.inverse(T_curr_odom)
         landmarks, predicted = self._map.visible(T_odom_curr)
         in_view = len(landmarks)
-        in_curr = se3.apply(coarse.T_curr_odom, self._map.table.points[landmarks])
-        shift = exposure.shift(in_curr)
+        shift = exposure.shift(se3.apply(T_curr_odom, self._map.table.points[landmarks]))
         aligned = self._map.align(frame.lower, T_odom_curr, landmarks, predicted[:, :2] - shift.lower)
-        landmarks, pixels = landmarks[aligned.found], aligned.pixels[aligned.found]
+        found = aligned.found
+        landmarks, pixels = landmarks[found], aligned.pixels[found]
         # 2. The views: aligned pixels, with the disparities of the tracks, corrected to the stamp of the pair.
-        disparity, variance = np.full(len(self._map), np.nan), np.zeros(len(self._map))
-        disparity[coarse.landmarks], variance[coarse.landmarks] = coarse.disparity, coarse.variance
         views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
-        noise = view_noise(aligned.covariance[aligned.found], variance[landmarks])
-        views += np.column_stack([shift.lower, shift.upper[:, 1]])[aligned.found]
+        noise = view_noise(aligned.covariance[found], variance[landmarks])
+        views += np.column_stack([shift.lower, shift.upper[:, 1]])[found]
         # 3. Solve for the pose and the velocity. The prior of the velocity is one measurement: unlike the landmarks'
-        # errors it is not correlated with others.
-        covariance = exposure.motion.covariance / CORRELATED
-        by_motion = shift.by_motion[aligned.found, :3]
-        shared = by_motion, covariance
-        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, shared)
+        #    errors it is not correlated with others.
+        by_motion = shift.by_motion[found, :3]
+        shared = by_motion, exposure.motion.covariance / CORRELATED
+        solution, kept = self._solve(landmarks, views, T_curr_odom, self._model, noise, shared)
         if solution is None:
             return None
         # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it. A squared distance is
         #    a sum of as many squares as a view has numbers, each with an expected value of 1.
-        T_odom_rect = se3.inverse(solution.T)
         scale = CORRELATED * max(1.0, float(solution.squared.mean()) / views.shape[1])
-        variance = variance[landmarks]
-        # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
-        # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
-        # and the scale would drift.
-        of_depth = (by_motion[:, 2] - by_motion[:, 1])[kept]
-        landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
-        is_kept = np.zeros(len(self._map), bool)
-        is_kept[landmarks] = True
-        rejected = tracks.pixels[~is_kept[tracks.landmarks]]
-        visible, tracked, supporting = (
-            round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks))
-        )
+        # 5. The mean cost of a landmark in view; an outlier costs what the last inlier does.
+        inliers = solution.squared[solution.squared < OUTLIER_SQUARED]
+        costs = float(cost(inliers).sum()) + (in_view - len(inliers)) * OUTLIER_COST
+        # 6. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
+        #    with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
+        #    and the scale would drift.
+        landmarks = landmarks[kept]
         return PoseEstimate(
-            T_odom_rect,
+            se3.inverse(solution.T),
             scale * solution.covariance,
-            visible,
-            tracked,
-            min(supporting, len(landmarks)),
-            landmarks,
-            views,
-            pixels,
-            variance[kept],
-            rejected,
-            of_depth,
-            exposure.motion,
-            _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
             in_view,
-            upper_ratio=_upper_ratio(frame, coarse),
+            int(found.sum()),
+            len(landmarks),
+            landmarks,
+            views[kept],
+            pixels[kept],
+            variance[landmarks],
+            by_motion=(by_motion[:, 2] - by_motion[:, 1])[kept],
+            assumed=exposure.motion,
+            cost=costs / max(1, in_view),
+            in_view=in_view,
         )
 
     def refine_recognised(
@@ -217,18 +213,16 @@ class PoseSearch:
     ) -> PoseEstimate | None:
         """Return the pose of a frame that was recognised, by the keyframes' patches; None where too few agree.
 
-        Places are recognised by corners, whose pose errs by centimetres. Corners and patches are two independent
-        supports of the pose: the number of inliers is the smaller one of both.
+        Places are recognised by corners, whose pose errs by centimetres: the first refinement brings most patches into
+        reach, the second one aligns them all. Corners and patches are two independent supports of the pose.
         """
-        none, refined = np.zeros(0, np.intp), recognised
-        tracks = Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0)
-        for _ in range(RECOGNISED_ROUNDS):
-            start = CoarsePose(se3.inverse(refined.T_odom_rect), none, np.zeros(0), np.zeros(0), tracks)
-            again = self.refine(frame, start, exposure)
-            if again is None:
-                return None
-            refined = again
-        inliers = min(recognised.inliers, len(refined.landmarks))
+        refined: PoseEstimate | None = recognised
+        unknown = np.full(len(self._map), np.nan), np.zeros(len(self._map))
+        for _ in range(2):
+            refined = refined and self.refine(frame, se3.inverse(refined.T_odom_rect), exposure, *unknown)
+        if refined is None:
+            return None
+        inliers = min(recognised.inliers, refined.inliers)
         return replace(refined, visible=recognised.visible, tracked=recognised.tracked, inliers=inliers)
 
     def _solve(
@@ -265,22 +259,3 @@ def is_good_enough(estimate: PoseEstimate | None, limits: OdometryLimits, *, is_
         and estimate.inlier_ratio >= limits.good_inlier_ratio
         and estimate.inliers >= limits.good_inliers
     )
-
-
-def _upper_ratio(frame: StereoFrame, coarse: CoarsePose) -> float:
-    """Return the share of the inliers among the tracks that were found in the upper panorama.
-
-    Where the cameras expose at several times it is 1: an acceleration that is not known hides rows as well.
-    """
-    if not frame.times.is_at_once or not len(coarse.disparity):
-        return 1.0
-    return float(np.isfinite(coarse.disparity).mean())
-
-
-def _cost(squared: Array, in_view: int) -> float:
-    """Return the mean cost of a landmark in view, by the squared errors (M,) of those that are inliers.
-
-    It is the negative logarithm of the likelihood with the Cauchy kernel, k^2 / 2 log(1 + e^2 / k^2), by the landmarks
-    that count as one; an outlier costs what the last inlier does.
-    """
-    return (float(cost(squared).sum()) + (in_view - len(squared)) * OUTLIER_COST) / max(1, in_view)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,24 +33,6 @@ class StereoFrame:
     def disparity(self) -> NDArray[np.float32]:
         """Disparities (H, W) [px] of the lower panorama's pixels at the stamp, NaN: unknown."""
         return self.disparities(self.exposure) if callable(self.disparities) else self.disparities
-
-    def packed(self) -> StereoFrame:
-        """Return the frame with a list of its disparities: for keeping, since few pixels have one.
-
-        A function of disparities keeps all evidence of its pair, and an image of them takes four bytes a pixel.
-        """
-        image = self.disparity
-        known = np.flatnonzero(np.isfinite(image)).astype(np.int32)
-        return replace(self, disparities=partial(_unpacked, image.shape, known, image.ravel()[known]))
-
-
-def _unpacked(
-    shape: tuple[int, ...], known: NDArray[np.int32], disparities: NDArray[np.float32], _: Exposure | None
-) -> NDArray[np.float32]:
-    """Return the image (H, W) of disparities (N,) at pixels (N,), which are known for one motion only."""
-    image = np.full(shape, np.nan, np.float32)
-    image.ravel()[known] = disparities
-    return image
 
 
 def _no_pixels() -> NDArray[np.float64]:

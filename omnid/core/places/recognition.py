@@ -298,7 +298,8 @@ class Relocaliser:
             apart_m = self._kept[-1][1].T_odom_rect[:3, 3] - keyframe.T_odom_rect[:3, 3]
             if np.linalg.norm(apart_m) < PlaceLimits().keyframe_m:
                 self._kept.pop()
-        self._kept.append((frame.packed(), keyframe))
+        # A function of disparities keeps all evidence of its pair.
+        self._kept.append((replace(frame, disparities=frame.disparity), keyframe))
 
     def clear(self) -> None:
         """Remove all keyframes."""
