@@ -70,9 +70,7 @@ class NewLandmarks:
     pixels: Array  # (N, 2) px in the lower panorama
     views: Array  # (N, 3) px, at the stamp
     slopes: Array  # (N, 2) px/px of the disparity
-    noise: Array  # (N, 3, 3) px^2 of the views, in addition to that of the model; that of the motion left out
-    by_motion: Array  # (N or 1, 3, K) px by m/s and rad/s: derivatives of the views by the velocity
-    assumed: RigVelocity  # by which the views were corrected
+    noise: Array  # (N, 3, 3) px^2 of the views, in addition to that of the model
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +103,8 @@ class LocalMap:
         self.keyframes: dict[int, Keyframe] = {}
         self._set_rows(np.zeros(0, LANDMARK))
         self.last: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
-        # What waits for the velocity at its frame, with the ids of its landmarks: an estimate, and new landmarks.
+        # The estimate that waits for the velocity at its frame, with the ids of its landmarks.
         self._seen: tuple[Indices, PoseEstimate] | None = None
-        self._added: tuple[Indices, NewLandmarks] | None = None
 
     def add_keyframe(self, keyframe: Keyframe, located: NewLandmarks) -> Flags:
         """Add a keyframe at the last panorama with new landmarks, and remove one beyond the bound.
@@ -124,10 +121,9 @@ class LocalMap:
         new["pixels"] = new["anchor_pixels"] = located.pixels[finite]
         self.keyframes[keyframe.seq] = keyframe
         self._set_rows(np.concatenate([self._rows, new]))
-        ids = np.full(len(finite), -1)
-        ids[finite] = new["id"]
-        self._set_views(ids, located, located.assumed)
-        self._added = (ids, located) if located.by_motion.shape[2] else None
+        camera = self._model.cylinder, self._model.baseline_m, self._model.sigma_px
+        covariance = point_covariance(points[finite], *camera, located.noise[finite])
+        self._place(np.arange(len(self) - len(new), len(self)), points[finite], covariance)
         if len(self.keyframes) > self._max_keyframes:
             counts = {seq: int((self._rows["anchor"] == seq).sum()) for seq in self.keyframes}
             others, half = counts.keys() - {keyframe.seq}, len(self._rows) / 2
@@ -135,29 +131,13 @@ class LocalMap:
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
         return finite
 
-    def _set_views(self, ids: Indices, located: NewLandmarks, velocity: RigVelocity) -> None:
-        """Set the positions of landmarks (ids (N,); -1, or those that have left: none) by their views in the anchors.
-
-        Where a view cannot be triangulated the landmark stays as it is.
-        """
-        J = located.by_motion
-        views = located.views + J @ (velocity.twist - located.assumed.twist)
-        noise = located.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2)
-        points = triangulate(views, self._model.cylinder, self._model.baseline_m)
-        chosen = np.isfinite(points).all(axis=1) & np.isin(ids, self.table.id)
-        camera = self._model.cylinder, self._model.baseline_m, self._model.sigma_px
-        covariance = point_covariance(points[chosen], *camera, noise[chosen])
-        self._place(np.searchsorted(self.table.id, ids[chosen]), points[chosen], covariance)
-
     def settle(self, velocity: RigVelocity | None) -> None:
-        """Correct the map by what waits, with the velocity at that frame; None: no better one than was assumed."""
-        if self._added is not None and velocity is not None:
-            self._set_views(*self._added, velocity)
+        """Correct depths by the estimate that waits, with the velocity at it; None: no better one than was assumed."""
         if self._seen is not None:
             ids, estimate = self._seen
             kept = np.isin(ids, self.table.id)
             self._correct(np.searchsorted(self.table.id, ids[kept]), estimate, kept, velocity or estimate.assumed)
-        self._seen = self._added = None
+        self._seen = None
 
     def accept(self, lower: PaddedPanorama, estimate: PoseEstimate) -> None:
         """Record the inliers of an accepted pose, and correct depths, at once or when the velocity is known."""

@@ -17,7 +17,6 @@ from calib.fit.rig_from_drive import DriveObservations
 from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
-from omnid.core.odometry.exposure_times import NO_VELOCITY
 from omnid.core.odometry.local_map import Keyframe, LocalMap, NewLandmarks
 from omnid.core.odometry.plane_patches import REACH_PX, disparity_slopes, fitted_slopes
 from omnid.core.odometry.tracking import KltSettings, track
@@ -108,7 +107,7 @@ class DriveLandmarks:
         slopes = fitted_slopes(pair, pixels, above, slopes, self._model)
         keyframe = Keyframe(self._number, current.lower, T_odom_rect, np.zeros((6, 6)))
         views, noise = np.column_stack([pixels, above[:, 1]]), np.zeros((len(pixels), 3, 3))
-        located = NewLandmarks(pixels, views, slopes, noise, np.zeros((1, 3, 0)), NO_VELOCITY)
+        located = NewLandmarks(pixels, views, slopes, noise)
         known = self._map.add_keyframe(keyframe, located)
         rows = np.flatnonzero(self._map.table.anchor == self._number)
         self._points = np.concatenate([self._points, self._map.table.points[rows]])
