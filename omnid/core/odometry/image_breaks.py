@@ -33,7 +33,7 @@ from omnid.core.odometry.line_times import CAMERAS, LAG_S, LEAST_PX, MEMORY_S, S
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 from omnid.core.odometry.plane_patches import WINDOW_PX, align, plane_templates
-from omnid.core.odometry.pose_estimation import CORRELATED, GAUSS_NEWTON_STEPS, cost
+from omnid.core.odometry.pose_estimation import CORRELATED, DAMPING, GAUSS_NEWTON_STEPS, OUTLIER_SQUARED, cost
 from omnid.core.odometry.pose_kernels import VIEW
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
@@ -46,22 +46,16 @@ Indices = NDArray[np.intp]
 
 MOST: Final = 160  # landmarks that are followed in each camera
 SIGMA_PX: Final = 0.1  # of a flow, because patches err by some hundredths, and people and shadows are near by
-# Squared Mahalanobis distance of a flow, a sum of two squares, from which on it is an outlier, and costs no more.
-OUTLIER_SQUARED: Final = 32.0
 MOST_SCALE: Final = 25.0  # of the variance of flows: half a pixel; where it is larger, flows are displaced
-GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera, or up to a line
 LINES: Final = 24  # equal parts of the raw image, at whose borders lines are tried
 LEAST: Final = 8  # flows on either side of a line in the cameras of a break
-# Part that counts: of the flows of a torn image, on either side of its line, as people hardly cover as many; of all
-# that right images leave; of the displacement of the other camera.
+# Part that counts: of the flows, that no break displaces; of those of a torn image, on either side of its line, as
+# people hardly cover as many; of all that right images leave.
 LEAST_PART: Final = 0.2
 RIGHT_COST: Final = float(cost(VIEW))  # of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected
 FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
-FAR: Final = KltSettings(levels=2)  # 28 px
-RIDGE: Final = 1e-6
 # Unknowns of another motion, of a shift and a turn of the whole image, and of a shift, perhaps beyond a line.
 TORN, TURNED, DISPLACED = 6, 3, 2
-CHOICES: Final = 2 * LINES * 3 * len(SETS)  # sides, lines, kinds, cameras
 
 
 class Break(NamedTuple):
@@ -72,9 +66,8 @@ class Break(NamedTuple):
     is_before: bool  # what is before the line is displaced, and not what is beyond
     line: float  # part of the raw image that is before the line; 0: the whole image is displaced
     amount: Array  # (C, 2 or 3) raw px, and turn, rad; of torn images (1, 6): motion
-    displaced: Array  # (N, 2) of the flows, in standard deviations
     gain: float  # logarithm of the likelihood ratio, less the cost of the parameters
-    angle_rad: float = 0.0  # by which what is beyond is displaced in view, mean
+    px: float  # by which what is beyond is displaced in view, mean
 
     def is_undone_by(self, other: Break) -> bool:
         """True if another displacement ends this one."""
@@ -123,7 +116,7 @@ class ImageBreaks:
         self._torn = 0.0  # gains of tears, less those forgotten
         self._last: _View | None = None
         self._last_tear: Break | None = None
-        self._open: list[Break] = []  # displacements that have not ended
+        self._open: Break | None = None  # a displacement that has not ended
         self._usual_cost = 0.0  # of a landmark in whole images: none is known yet, so that the first pairs are tested
 
     def add(
@@ -143,13 +136,13 @@ class ImageBreaks:
         last, found = self._last, None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ estimate.T_odom_rect)
         self._last = now = _View(pair, estimate.T_odom_rect, exposure, step)
-        is_broken = self._torn > DECIDING_COST or bool(self._open)
+        is_broken = self._torn > DECIDING_COST or self._open is not None
         is_usual = costs is not None and costs[1] * (costs[0] - self._usual_cost) < DECIDING_COST and not is_broken
         # A pose that was only predicted says too little about the motion between several exposures.
         is_known = exposure.times.is_at_once or (costs is not None and exposure.is_known)
         if last is not None and dt_s > 0 and is_known and last.exposure.is_known and not is_usual:
             flow = _flow((last, now), self._raws, local_map, self._model, LAG_S / dt_s)
-            found = None if flow is None else likeliest_break(flow, self._model.cylinder.focal_px)
+            found = None if flow is None else likeliest_break(flow)
         if costs is not None and found is None:
             usual = self._usual_cost + FOLLOWED * (costs[0] - self._usual_cost)
             self._usual_cost = min(usual, RIGHT_COST)  # a run whose images are broken from the start is not usual
@@ -161,11 +154,9 @@ class ImageBreaks:
         if found is not None and found.is_torn:
             self._torn, self._last_tear = self._torn + found.gain, found
         elif found is not None:
-            before = self._open
-            self._open = [earlier for earlier in before if not earlier.is_undone_by(found)]
-            self._open += [found] if len(self._open) == len(before) else []
+            self._open = None if self._open is not None and self._open.is_undone_by(found) else found
         is_torn = self._torn > DECIDING_COST
-        shown = found or (self._last_tear if is_torn else None) or (self._open[-1] if self._open else None)
+        shown = found or (self._last_tear if is_torn else None) or self._open
         read_out = self.lines.likeliest() if shown is None else None
         self.fault = "" if shown is None else shown.words(self._raws)
         if shown is not None:
@@ -176,7 +167,7 @@ class ImageBreaks:
             return
         A = se3.adjoint(se3.exp(-step))
         share = 1.0 if is_torn else min(1.0, abs(read_out.time_s) / dt_s) if read_out is not None and dt_s else 0.0
-        angle_rad = 0.0 if found is None else found.angle_rad
+        angle_rad = 0.0 if found is None else found.px / self._model.cylinder.focal_px
         self.covariance = A @ self.covariance @ A.T
         self.covariance += share**2 * (np.outer(step, step) + np.outer(last.step, last.step))
         self.covariance += angle_rad**2 * np.diag(np.repeat([estimate.distance_m**2, 1.0], 3))
@@ -203,12 +194,12 @@ class _Flow:
         lefts = [self.y - self.null @ _robust(self.null, self.y, start) for start in starts]
         squares = [(left**2).sum(axis=1) for left in lefts]
         # A step that is wrong must explain much more to be believed.
-        costs = [np.minimum(each, OUTLIER_SQUARED * MOST_SCALE).sum() for each in squares]
+        costs = [np.minimum(each, 2 * OUTLIER_SQUARED * MOST_SCALE).sum() for each in squares]
         best = int(costs[1] < costs[0] / 2)
-        # So many sums of two squares of unit variance are below -2 log(1 - GOOD_SHARE).
-        scale = np.quantile(squares[best], GOOD_SHARE) / (-2 * math.log(1 - GOOD_SHARE))
+        # So many sums of two squares of unit variance are below -2 log(1 - LEAST_PART).
+        scale = np.quantile(squares[best], LEAST_PART) / (-2 * math.log(1 - LEAST_PART))
         scale = float(np.clip(scale, 1.0, MOST_SCALE))
-        return lefts[best], OUTLIER_SQUARED * scale, 2 * scale * CORRELATED
+        return lefts[best], 2 * OUTLIER_SQUARED * scale, 2 * scale * CORRELATED
 
 
 def _flow(
@@ -245,7 +236,7 @@ def _flow(
         there, found = end.copy(), np.zeros(len(end), bool)
         for guess in (end, start):
             rest = rows[~found[rows]]
-            tracked, ok = track(last.pair[camera], now.pair[camera], start[rest], guess[rest], FAR)
+            tracked, ok = track(last.pair[camera], now.pair[camera], start[rest], guess[rest], KltSettings())
             there[rest[ok]], found[rest[ok]] = tracked[ok], True
         # The upper camera is like a lower one whose frame is higher, in which slopes are those over its own rows.
         up, bent = np.eye(4), slopes[rows] / (1.0 + camera * slopes[rows, 1:])
@@ -279,31 +270,21 @@ def _flow(
     return flow if len(flow.y) >= max(3 * LEAST, sought / 2) else None
 
 
-def likeliest_break(flow: _Flow, focal_px: float) -> Break | None:
+def likeliest_break(flow: _Flow) -> Break | None:
     """Return the likeliest break that flows show beyond doubt; None: there is none."""
-    left, outlier, unit = flow.whole()
+    left, outlier, unit = whole = flow.whole()
     all_gain = float(np.minimum((left**2).sum(axis=1), outlier).sum()) / unit
     if all_gain < DECIDING_COST + _cost(2, len(flow.y)):
         return None  # no break explains more than all that is left
-    best: Break | None = None
+    found: list[Break] = []
     for size in (TORN, TURNED, DISPLACED):
-        # Six unknowns fit some of many wrong depths.
+        # The six unknowns of a motion fit some of many wrong depths.
         least = max(DECIDING_COST, LEAST_PART * all_gain * (size == TORN))
-        for cameras in SETS:
-            for found in _candidates(flow, (left, outlier, unit), size, cameras):
-                if found.gain > (least if best is None else max(least, best.gain)):
-                    best = found
-    if best is None:
-        return None
-    # Cameras that have a share in it; what is too small harms no pose.
-    moved_px = np.linalg.norm(best.displaced, axis=1) * flow.px
-    mean_px = [float(moved_px[(flow.camera == camera) & (moved_px > 0)].mean()) for camera in best.cameras]
-    shares = [number for number, px in enumerate(mean_px) if px > LEAST_PART * max(mean_px)]
-    if max(mean_px) < LEAST_PX:
-        return None
-    sharing: tuple[int, ...] = tuple(best.cameras[number] for number in shares)
-    amount = best.amount if best.is_torn else best.amount[shares]
-    return best._replace(cameras=sharing, amount=amount, angle_rad=max(mean_px) / focal_px)
+        each = (broken for cameras in SETS for broken in _candidates(flow, whole, size, cameras))
+        found += [broken for broken in each if broken.gain > least]
+    best = max(found, key=lambda broken: broken.gain, default=None)
+    # What is too small harms no pose.
+    return best if best is not None and best.px >= LEAST_PX else None
 
 
 def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, cameras: tuple[int, ...]) -> Iterator[Break]:
@@ -319,8 +300,7 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
     most_off = int(np.bincount(flow.camera[is_off], minlength=2).argmax())
     own = [flow.camera == camera for camera in cameras]
     # 1. A motion is one of both cameras, a displacement is one of each.
-    F = null[:, :, :size] if is_torn else flow.shift[:, :, :size]
-    masks = [np.logical_or.reduce(own)] if is_torn else own
+    F, masks = (null[:, :, :size], [np.logical_or.reduce(own)]) if is_torn else (flow.shift[:, :, :size], own)
     columns = np.concatenate([F * mask[:, None, None] for mask in masks], axis=2)
     # 2. Amounts to start from: of all flows, and of those that right images do not explain.
     starts = []
@@ -337,7 +317,7 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
         # 3. The likeliest line, of both sides; 0: the whole image.
         left = y - null @ start[:unknowns]
         extra = gains(left - columns @ start[unknowns:]) - gains(left)
-        for side, line in _likely_lines(flow, size, extra, own):
+        for side, line in _likely_lines(flow.row, extra, own, size):
             # One image displaced is the other one displaced the other way, and a step.
             if line == 0 and cameras == (1 - most_off,):
                 continue
@@ -346,37 +326,41 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
             masked = np.concatenate([null, columns * beyond[:, None, None]], axis=2)
             solution = _robust(masked, y, start)
             gain = float(gains(y - masked @ solution).sum()) - _cost(columns.shape[2], len(y))
-            amount = solution[unknowns:]
-            displaced = masked[:, :, unknowns:] @ amount
-            yield Break(is_torn, cameras, side, line, amount.reshape(len(masks), -1), displaced, gain)
+            moved_px = np.linalg.norm(masked[:, :, unknowns:] @ solution[unknowns:], axis=1) * flow.px
+            px = float(moved_px.sum() / max(1, np.count_nonzero(moved_px)))
+            yield Break(is_torn, cameras, side, line, solution[unknowns:].reshape(len(masks), -1), gain, px)
 
 
-def _likely_lines(flow: _Flow, size: int, extra: Array, own: list[Flags]) -> list[tuple[bool, float]]:
-    """Return side and line, a part of the raw image, of the whole image and of the likeliest line in it.
+def _likely_lines(row: Array, extra: Array, own: list[Flags], size: int) -> list[tuple[bool, float]]:
+    """Return side and line, a part of the raw image, of the whole image (if it is not torn) and of the likeliest line.
 
-    extra (N,): by how much likelier a break makes each flow; own: flags (N,) of each camera that may have it.
+    row, extra (N,): of each flow, its row and by how much likelier a break makes it; own: flags (N,) of each camera
+    that may have the break.
     """
-    found, lines = [], np.arange(1, LINES)[:, None] / LINES
-    for side in (False, True) if size != TURNED else ():
-        beyond = (flow.row >= lines) != side
-        counts = np.array([[(beyond & each).sum(axis=1), (~beyond & each).sum(axis=1)] for each in own])
-        least = np.array([LEAST_PART * each.sum() if size == TORN else LEAST // len(own) for each in own])
-        gains = np.where((counts >= least[:, None, None]).all(axis=(0, 1)), beyond @ extra, -np.inf)
-        found.append((float(gains.max()), (side, (1 + int(gains.argmax())) / LINES)))
-    likeliest = [max(found)[1]] if found and max(found)[0] > 0 else []
-    return likeliest if size == TORN else [(False, 0.0), *likeliest]
+    found, lines = [] if size == TORN else [(False, 0.0)], np.arange(1, LINES) / LINES
+    if size == TURNED:
+        return found
+    is_beyond = row >= lines[:, None]
+    enough = np.ones(len(lines), bool)
+    for each in own:
+        least = LEAST_PART * each.sum() if size == TORN else LEAST / len(own)
+        enough &= ((is_beyond & each).sum(axis=1) >= least) & ((~is_beyond & each).sum(axis=1) >= least)
+    gains = np.where(enough, np.stack([is_beyond @ extra, ~is_beyond @ extra]), -np.inf)
+    side, number = np.unravel_index(gains.argmax(), gains.shape)
+    return [*found, (bool(side), float(lines[number]))] if gains.max() > 0 else found
 
 
 def _cost(parameters: int, flows: int) -> float:
-    """Return the penalty of a displacement with so many parameters by so many flows, and of the choice."""
-    return 0.5 * parameters * math.log(2 * flows) + math.log(CHOICES)
+    """Return the penalty of a break with so many parameters by so many flows, and of the choice.
+
+    Chosen are side and line, one of three kinds, and cameras.
+    """
+    return 0.5 * parameters * math.log(2 * flows) + math.log(2 * LINES * 3 * len(SETS))
 
 
 def _common(A: Array, y: Array) -> Array:
     """Return x (K,) that most of y - A x (N, 2) agree with."""
-    along = np.swapaxes(A, 1, 2)
-    each = np.linalg.solve(along @ A + RIDGE * np.eye(A.shape[2]), along @ y[:, :, None])[:, :, 0]
-    return _robust(A, y, np.median(each, axis=0))
+    return _robust(A, y, np.median((np.linalg.pinv(A) @ y[:, :, None])[:, :, 0], axis=0))
 
 
 def _robust(A: Array, y: Array, x: Array) -> Array:
@@ -389,6 +373,6 @@ def _robust(A: Array, y: Array, x: Array) -> Array:
 def _least_squares(A: Array, y: Array, weight: Array) -> Array:
     """Return x (K,) that minimises the sum of weights (N,) times |y - A x|^2; the seventh, the lag, has a prior."""
     size = A.shape[2]
-    weighted, prior = (weight[:, None, None] * A).reshape(-1, size), np.full(size, RIDGE)
+    weighted, prior = (weight[:, None, None] * A).reshape(-1, size), np.full(size, DAMPING)
     prior[6:7] = 1.0
     return np.asarray(np.linalg.solve(weighted.T @ A.reshape(-1, size) + np.diag(prior), weighted.T @ y.ravel()))

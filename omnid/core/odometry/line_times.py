@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 LAG_S: Final = 0.003  # standard deviation of the time between the exposures of two cameras that are triggered together
 LEAST_PX: Final = 0.5  # least displacement of a part of an image against the rest: less harms no pose
 MEMORY_S: Final = 1.0  # time constant with which old evidence decays: vehicles change their motion more often
-EVERY_S: Final = 0.04  # least time between two pairs that are used: nearer ones show the same motion
 CAMERAS: Final = ("lower", "upper")
 LAG: Final = 2  # the unknown behind the times of the lower and the upper camera
 SETS: Final = ((0,), (1,), (0, 1))  # cameras whose images are wrong in one way
@@ -94,7 +93,6 @@ class LineTimes:
         self._velocities: dict[int, Array] = {}  # (6,) of the rig at each keyframe
         self._information = np.zeros((LAG + 2, LAG + 2))  # of [c, lag], bordered by that of the residuals
         self._views = 0.0  # that were pooled
-        self._since_s = 0.0  # since the last pair that was used
         self._px_per_s = 0.0  # median motion of the landmarks in the last image
 
     def add(self, seq: int, seen: PoseEstimate, local_map: LocalMap, velocity: Array, dt_s: float) -> None:
@@ -105,10 +103,6 @@ class LineTimes:
         # 1. The velocities at the keyframes: the first one of a map has that of the step after it.
         known = {key: self._velocities.get(key, velocity) for key in local_map.keyframes}
         self._velocities = known | {seq: velocity}
-        self._since_s += dt_s
-        if self._since_s < EVERY_S:
-            return
-        dt_s, self._since_s = self._since_s, 0.0
         # 2. Residuals of the views, and their derivatives by [d_k, c, lag].
         cylinder, baseline_m = self._model.cylinder, self._model.baseline_m
         every = round(CORRELATED)
@@ -157,15 +151,14 @@ class LineTimes:
         information = self._information.copy()
         information[LAG, LAG] += LAG_S**-2
         information -= np.outer(information[:, LAG], information[LAG]) / information[LAG, LAG]
-        best: ReadOut | None = None
-        cost = 0.5 * math.log(1.0 + VIEW * self._views) + math.log(len(SETS))
+        cost, found = 0.5 * math.log(1.0 + VIEW * self._views) + math.log(len(SETS)), []
         for cameras in SETS:
             A, b = float(information[np.ix_(cameras, cameras)].sum()), float(information[list(cameras), -1].sum())
-            found = ReadOut(cameras, b / A, b**2 / (2 * A) - cost) if A > 0 else None
-            if found is not None and (best is None or found.gain > best.gain):
-                best = found
-        is_seen = best is not None and abs(best.time_s) * self._px_per_s > LEAST_PX
-        return best if best is not None and best.gain > 0 and is_seen else None
+            if A > 0:
+                found.append(ReadOut(cameras, b / A, b**2 / (2 * A) - cost))
+        best = max(found, key=lambda each: each.gain, default=None)
+        is_seen = best is not None and best.gain > 0 and abs(best.time_s) * self._px_per_s > LEAST_PX
+        return best if is_seen else None
 
     def _shifts(self, points: Array, J: Array, velocity: Array) -> tuple[Array, Array]:
         """Return the derivatives (N, 3, 3) of the views of points (N, 3) by [c, lag], and their motion (N, 3) [px/s].
