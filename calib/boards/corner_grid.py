@@ -125,6 +125,8 @@ Indices = NDArray[np.int64]
 # Number of nearest candidates among which an arm's neighbour is chosen, because a grid has so many within three
 # squares.
 NEAREST = 28
+# Largest angle between an arm and the line to its neighbour, because edges in a mirror image are curved.
+MAX_TURN_RAD = np.deg2rad(22)
 # The edge between two neighbours is sampled at these fractions of it, on both sides, the first fraction away.
 ALONG = np.linspace(0.2, 0.8, 5)
 # No index, because the least one is 0.
@@ -154,7 +156,7 @@ def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[Indices, In
     angle = np.arctan2(step[:, 1], step[:, 0])
     arm_a, arm_b = _arm_along(corners.angles[a], angle), _arm_along(corners.angles[b], angle + np.pi)
     left_is_light = corners.light[a] ^ (arm_a % 2 == 1)
-    fits = left_is_light == ~(corners.light[b] ^ (arm_b % 2 == 1))
+    fits = (arm_a >= 0) & (arm_b >= 0) & (left_is_light == ~(corners.light[b] ^ (arm_b % 2 == 1)))
     a, b, arm_a, arm_b, step, left_is_light = (one[fits] for one in (a, b, arm_a, arm_b, step, left_is_light))
     # 3. An edge along the line, with light and dark on the same sides as at a's arm.
     across = ALONG[0] * np.column_stack([-step[:, 1], step[:, 0]])  # towards larger angles
@@ -170,6 +172,7 @@ def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[Indices, In
 
 
 def _arm_along(edges: Array, angle: Array) -> Indices:
-    """Return the arm (M,) of corners with edges (M, 2) [rad] that is nearest to an angle (M,)."""
+    """Return the arm (M,) of corners with edges (M, 2) [rad] that points along an angle (M,); NO_NEIGHBOUR if none."""
     arms = np.concatenate([edges, edges + np.pi], axis=1)
-    return np.asarray(np.abs((arms - angle[:, None] + np.pi) % (2 * np.pi) - np.pi).argmin(axis=1))
+    off = np.abs((arms - angle[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    return np.where(off.min(axis=1) < MAX_TURN_RAD, off.argmin(axis=1), NO_NEIGHBOUR)
