@@ -60,8 +60,9 @@ class GridParameters:
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
     shown_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
-    shown_least: float = 0.025  # mean from which something hangs there,
-    shown_weight: float = 100.0  # and its log-odds by this mean
+    shown_least: float = 0.08  # mean from which something hangs there,
+    shown_weight: float = 30.0  # and its log-odds by this mean
+    shown_comes: float = 0.07  # mean from which something that hangs has come onto floor that was free
 
 
 CELL_M: Final = kernels.CELL_M
@@ -283,7 +284,8 @@ class ObstacleGrid:
         lately = self._free_s < p.lately_s
         self._free_s[taken < 1 / (1 + math.exp(-p.prior))] = 0
         # Who comes is wider than a speck of noise.
-        came = ((taken > 0.5) & (taken <= 1)) | (flooded > 0)
+        around, is_most = self._hanging()
+        came = ((taken > 0.5) & (taken <= 1)) | (flooded > 0) | ((around > p.shown_comes) & is_most)
         came |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
         # The first one of each direction, before floor that was free, by the noise of stereo and more.
         first = came[rays].argmax(axis=1)
@@ -329,12 +331,17 @@ class ObstacleGrid:
 
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
-        p = self._p
-        around = cv2.blur(self._shown, (5, 5))
+        p, (around, is_most) = self._p, self._hanging()
         hanging = np.clip(p.shown_weight * (around - p.shown_least), -9.0, 6.0) + np.float32(p.prior)
-        hanging[self._shown < around] = p.arrival  # it is where most is shown of what is around
+        hanging[~is_most] = p.arrival
         taken = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
         return np.where((self._known > 0) | (self.odds > 0), taken, np.float32(2))
+
+    def _hanging(self) -> tuple[Floats, Flags]:
+        """Return the mean of what single pairs show around cells, and whether a cell shows at least as much: there
+        hangs what is shown around."""
+        around = np.asarray(cv2.blur(self._shown, (5, 5)), np.float32)
+        return around, self._shown >= around
 
     def _who_comes(self, passed_s: float, watched: Flags) -> None:
         """Spread what is not known through cells that nobody sees."""
