@@ -8,7 +8,6 @@ path. A moving object is an obstacle where the base would meet it. While no way 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
@@ -153,60 +152,34 @@ class Navigation(NamedTuple):
     offset_m: float = math.nan  # distance of the base to the left of the path
 
 
-class Rule(NamedTuple):
-    """A reason to stop or to end a drive."""
+def held(drive: Drive, now: Situation, settings: NavigationSettings) -> tuple[NavigationState, str] | None:
+    """Return the state and the reason of a drive that may not go on now, None of one that may.
 
-    state: NavigationState
-    words: Callable[[Drive, Situation, NavigationSettings], str]  # empty: it does not hold
-
-
-def _stopped(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
-    return ASKED if _fault(drive, now) == ASKED else ""
-
-
-def _fault(drive: Drive, now: Situation) -> str:
-    """Return the stop or fault that has disarmed the wheels, also if they were armed again since; empty without one."""
+    The first rule that holds decides: an end is final, everything else is waited for.
+    """
+    # 1. A stop or fault that has disarmed the wheels, also if they were armed again since.
     wheels = now.wheels
+    fault = wheels.disarmed_by if wheels.needs_request else ""
     if wheels.stop_count != drive.stop_count:
-        return wheels.stopped_by
-    return wheels.disarmed_by if wheels.needs_request else ""
-
-
-def _new_odom(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
-    is_lost = drive.resets != now.resets and drive.frame is NavigationFrame.ODOM
-    return "odometry has lost its map and begun again: ask again" if is_lost else ""
-
-
-def _paused(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
-    fault = _fault(drive, now)
-    drive.paused = f"disarmed: {fault}: see to it, then {RESUME}" if fault else drive.paused
-    return drive.paused
-
-
-def _lost(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
-    return "odometry is lost" if now.state is TrackingState.LOST else ""
-
-
-def _not_in_map(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
-    if drive.frame is NavigationFrame.ODOM or drive.unlocalised_m <= settings.unlocalised_m:
-        return ""
-    return refusal_of_map(now, settings.map_sigma_m).partition(":")[0] or "not localised"
-
-
-def _operated(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
-    source = now.wheels.source
-    return "" if source in ("", PLANNER) else f"{source} drives: it goes on when that ends"
-
-
-# The first rule that holds decides: an end is final, everything else is waited for.
-RULES: Final = (
-    Rule(NavigationState.CANCELLED, _stopped),
-    Rule(NavigationState.FAILED, _new_odom),
-    Rule(NavigationState.PAUSED, _paused),
-    Rule(NavigationState.NOT_LOCALISED, _lost),
-    Rule(NavigationState.NOT_LOCALISED, _not_in_map),
-    Rule(NavigationState.PAUSED, _operated),
-)
+        fault = wheels.stopped_by
+    if fault == ASKED:
+        return NavigationState.CANCELLED, ASKED
+    # 2. The pose.
+    if drive.resets != now.resets and drive.frame is NavigationFrame.ODOM:
+        return NavigationState.FAILED, "odometry has lost its map and begun again: ask again"
+    if fault:
+        drive.paused = f"disarmed: {fault}: see to it, then {RESUME}"
+    if drive.paused:
+        return NavigationState.PAUSED, drive.paused
+    if now.state is TrackingState.LOST:
+        return NavigationState.NOT_LOCALISED, "odometry is lost"
+    if drive.frame is NavigationFrame.MAP and drive.unlocalised_m > settings.unlocalised_m:
+        why = refusal_of_map(now, settings.map_sigma_m).partition(":")[0]
+        return NavigationState.NOT_LOCALISED, why or "not localised"
+    # 3. Who else drives.
+    if wheels.source not in ("", PLANNER):
+        return NavigationState.PAUSED, f"{wheels.source} drives: it goes on when that ends"
+    return None
 
 
 @dataclass(slots=True)
@@ -274,10 +247,9 @@ class Navigator:
             return Navigation(stop, self.state, self.reason)
         # 1. Wheels, pose, and who else drives.
         self._follow_map(drive, now)
-        for rule in RULES:
-            words = rule.words(drive, now, settings)
-            if words:
-                return self._wait(drive, rule.state, words, dt_s)
+        hold = held(drive, now, settings)
+        if hold is not None:
+            return self._wait(drive, *hold, dt_s)
         drive.resets = now.resets
         # 2. The way.
         following = drive.step(now, self._room_m(drive, now))
