@@ -152,18 +152,20 @@ def posterior(
             hanging = beyond + terms[FITS, n, u] - p.surface_noise + log_over + log_length[n]
             total[n] = log_sum(begins, hanging)
             beyond = log_sum(beyond, begins)
-            if n == 0:
-                total[n] = log_sum(total[n], nearer)
             high = max(high, total[n])
+        high = max(high, nearer)
         # 6. Normalised.
-        last = weight = math.exp(none - high)
+        hidden = math.exp(nearer - high)
+        last = math.exp(none - high)
+        weight = last + hidden
         for n in range(bins):
             total[n] = math.exp(total[n] - high) if total[n] - high > -40.0 else 0.0
             weight += total[n]
-        reach = 1.0
+        hidden /= weight
+        reach = 1.0 - hidden
         for n in range(bins):
             found = total[n] / weight
-            first[u, n] = found
+            first[u, n] = found if n else found + hidden
             # 7. For the grid: log-ratio of a thing here, where the ray comes, to its prior.
             ratios[u, n], view[u, n] = 0.0, reach
             if reach > LEAST_REACH:
