@@ -83,7 +83,7 @@ class Drive:
     lost_s: float = 0.0  # time since then for which no way was free
     tried_s: float = 0.0  # time since then on ways that were blocked again
     way_s: float = 0.0  # time on the present way
-    ways: int = 0  # number of ways that were begun since then
+    ways: int = 0  # number of ways that were tried since then
     searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why that search found none
     move: Move | None = None  # kind of the newest motion that was wanted
@@ -360,6 +360,7 @@ class Navigator:
             return False
         drive.searched_ns, drive.is_waiting = now.stamp_ns, False
         if is_blocked and detour is not None:
+            drive.ways += drive.way_s * 1e9 > AGAIN_NS  # what was not driven was not tried
             drive.tried_s, drive.way_s = drive.tried_s + drive.way_s, 0.0
         found = self._search(drive, now, around, drive.move if now.wheels.held_by else None)
         if not isinstance(found, str) and is_blocked and drive.ways >= MOST_WAYS:
@@ -374,7 +375,6 @@ class Navigator:
             drive.is_waiting = may_leave and found.length_m > worth_m
             if drive.is_waiting:
                 return False
-            drive.ways += 1
         elif detour is not None:
             left_s = detour.time_s * following.left_m / max(detour.follower.path.length_m, SHORTEST_M)
             if found.time_s > BETTER * left_s:
