@@ -26,7 +26,7 @@ OUTLIER = np.uint8(4 * UNITS)  # Most units by which a pixel differs, because mo
 # beside the floor, which are compared in seven directions together, with weights of 64 in all.
 DIFFERENCE_SCALE, LEVEL_SCALE = np.float32(0.5 / UNITS), np.float32(1.5 / (64 * UNITS))
 # Log-likelihood by which the best of the deeper planes may fit better than the floor by noise, 1.5 in the mean of a
-# plain floor. With 3, by trial, bases stood on boards of 10 cm that are nearly alike.
+# plain floor. With 3, by trial, bases did not move on boards of 10 cm that look nearly the same.
 DEEP_NOISE = np.float32(10.0)
 STRIP_BOUND = np.float32(3.0)  # limit of the log-likelihood ratio of a strip
 STRIP_PRIOR = np.float32(0.5)  # log-odds by which a strip of a surface must exceed its other explanations
@@ -35,9 +35,9 @@ STRIP_PRIOR = np.float32(0.5)  # log-odds by which a strip of a surface must exc
 # floor, 94 % were found with 0.1 and 0.03, 92 % with 0.3, 66 % with 1.
 FLOOR_WEIGHT, BELOW_WEIGHT = np.float32(10.0), np.float32(0.1)
 # An object often hides the floor near itself: decay of the prior with the disparity, and the share of it that is left
-# far away. Measured: two thirds to 1.5 times as much are alike.
+# far away. Measured: two thirds to 1.5 times as much change nothing.
 ADJACENT_PX, DISTANT_SHARE = 4.0, np.float32(0.1)
-# exp(x) is taken as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
+# exp(x) is computed as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
 EXP_SHARE = np.float32(1 / 32)
 # Sums of likelihoods are never less than this share of one disparity's, so that ratios stay finite.
 LEAST_LIKELIHOOD = np.float32(1e-3)
@@ -224,9 +224,9 @@ def add_run(
 ) -> None:
     """Go on with the maximum-sum runs (W,) by a strip (Kadane), and raise `best` to them.
 
-    before, mine, after: likelihoods of three neighbouring disparities; total: of all of them. The logarithm is taken as
-    2 (x^(1/4) - x^(-1/4)); blank: that of the number of the others by these three. A strip without texture, and one
-    that fits at two disparities, is no evidence.
+    before, mine, after: likelihoods of three neighbouring disparities; total: of all of them. The logarithm is
+    approximated by 2 (x^(1/4) - x^(-1/4)); blank: that of the number of the others by these three. A strip without
+    texture, and one that fits at two disparities, is no evidence.
     """
     for u in range(len(run)):
         three = before[u] + mine[u] + after[u]

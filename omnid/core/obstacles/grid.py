@@ -4,7 +4,7 @@ Cells of 5 cm, in the axes of odom and around the cell of the base, hold the log
 steps there, and whether they are known.
 1. Evidence of a pair: e = r log [q / (1 - q)] / [q_0 / (1 - q_0)] of each bin, q the probability that the first thing
    is there where the ray comes with the probability r; q_0 its prior. So the prior of the rays does not count twice.
-2. Errors of pairs from one place are alike: noise with the correlation rho, that falls to 0 over 5 cm of way. Of a pair
+2. Errors of pairs from one place are correlated, by rho, which falls to 0 over 5 cm of way. Of a pair
    counts what is new: L += e - rho e', e' that of the pair before. L forgets by (1 - rho) / n, as more than n views of
    a place are no more. What hangs over floor in view shows a surface in half of the pairs: the mean of what single
    pairs show, over 25 cm, has log-odds of its own.
@@ -12,7 +12,7 @@ steps there, and whether they are known.
    and what nobody sees may be entered from where nothing is known, at 1.6 m/s by a person, 25 cm wide.
 4. Too near to be seen: known by what is seen past a cell. What hides the nearest floor in view may stand anywhere
    before it, unless something is known there.
-5. Who comes: the first thing of a direction, where the floor was free a short while ago.
+5. What has come: the first thing of a direction, where the floor was free a short while ago.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class GridParameters:
 
     prior: float = -4.6  # of a thing in a cell
     floor: float = -7.0  # of a cell by whose look floor is known
-    arrival: float = -9.0  # least log-odds, as something may come into each cell in each pair
+    least: float = -9.0  # least log-odds, as something may come into each cell in each pair
     most: float = 6.0
     views: float = 3.0  # n: views of a place that count
     same_place: float = 0.9  # rho: correlation of the errors of pairs from one place, 0 after the way of a cell
@@ -54,15 +54,15 @@ class GridParameters:
     person_cells: int = 5  # width of who may
     strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
-    comes: float = 2.0  # by which one pair shows a thing that has come [nats]
+    arrival_nats: float = 2.0  # by which one pair shows a thing that has come [nats]
     lately_s: float = 3.0  # for how long it counts that a cell was free
-    comes_m: float = 0.2  # least width of who comes,
+    arrival_m: float = 0.2  # least width of what has come,
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
-    shown_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
-    shown_least: float = 0.08  # mean from which something hangs there,
-    shown_weight: float = 30.0  # and its log-odds by this mean
-    shown_comes: float = 0.07  # mean from which something that hangs has come onto floor that was free
+    surface_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
+    hanging_least: float = 0.08  # mean from which something hangs there,
+    hanging_weight: float = 30.0  # and its log-odds by this mean
+    arrival_surface: float = 0.07  # mean from which something that hangs has come onto floor that was free
 
 
 CELL_M: Final = kernels.CELL_M
@@ -160,7 +160,8 @@ class ObstacleGrid:
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
         # views past it; whether the last pair saw floor behind it; time [s] since it was free.
-        self.odds, self._before, self._shown, self._known, self._past_views, self._was_past, self._free_s = self._layers
+        self.odds, self._before, self._surface, self._known, *others = self._layers
+        self._past_views, self._was_past, self._free_s = others
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
@@ -189,37 +190,37 @@ class ObstacleGrid:
         observed = in_view & (found[kernels.VIEW] > 0.5)
         # 2. What is new of it.
         keep, change = 1 - (1 - rho) / p.views, found[kernels.RATIO] - np.float32(rho) * self._before
-        updated = np.clip(p.prior + np.float32(keep) * (self.odds - p.prior) + change, p.arrival, p.most)
+        updated = np.clip(p.prior + np.float32(keep) * (self.odds - p.prior) + change, p.least, p.most)
         self.odds[:] = np.where(in_view, updated, self.odds)
         self._before[:] = np.where(in_view, found[kernels.RATIO], 0)
-        shown = np.float32(p.shown_rate * (1 - rho)) * (found[kernels.SURFACE] - self._shown)
-        self._shown += np.where(in_view, shown, 0)
+        surface = np.float32(p.surface_rate * (1 - rho)) * (found[kernels.SURFACE] - self._surface)
+        self._surface += np.where(in_view, surface, 0)
         # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
         #    known after so many more views past it.
         self._past_views[past] += np.float32(1 - rho)
         self._past_views[observed] = p.views
-        taken_back = hidden & (self._past_views < p.views)
-        self._past_views[taken_back] = np.maximum(self._past_views[taken_back] - p.views * (1 - rho), 0)
+        is_doubted = hidden & (self._past_views < p.views)
+        self._past_views[is_doubted] = np.maximum(self._past_views[is_doubted] - p.views * (1 - rho), 0)
         self._known[observed | (past & (self._past_views >= p.views))] = 1
         if is_first:
             self._assume_free(columns, hides, belief)
-        # 4. What hides the nearest floor in view, behind which floor was seen before, may stand anywhere before it.
-        #    What hides it from the start may stand where it did. And who comes where nobody sees.
+        # 4. What hides the nearest floor in view, behind which floor was seen before, may be anywhere before it. What
+        #    hides it from the start may be where it was. And somebody may come where no pair shows the floor.
         rays = _along(self._eye, yaw)
-        flooded = self._flooded(hidden, rays)
+        possible = self._hidden_before(hidden, rays)
         if not is_first:
-            watched = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
-            self._who_comes(passed_s, watched)
+            visible = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
+            self._spread_unknown(passed_s, visible)
         self._was_past[:] = past
-        self._known[flooded > 0] = 0
-        # 5. Who has come, and the scan.
-        taken = self._taken()
-        arrivals = self._arrivals(passed_s, rays, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
-        self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN], taken[OWN, OWN] = p.arrival, 1, 0, 0
+        self._known[possible > 0] = 0
+        # 5. What has come, and the scan.
+        occupied = self._occupied()
+        arrivals = self._arrivals(passed_s, rays, occupied, in_view & (found[kernels.RATIO] > p.arrival_nats), possible)
+        self.odds[OWN, OWN], self._known[OWN, OWN], self._surface[OWN, OWN], occupied[OWN, OWN] = p.least, 1, 0, 0
         assert self._cell is not None
-        cells = np.where(taken > 1, np.float32(np.nan), taken)
+        cells = np.where(occupied > 1, np.float32(np.nan), occupied)
         grid = FloorGrid(np.asarray(CELL_M * (self._cell - REACH_CELLS), float), cells)
-        return GridScan(*self._ways(taken, self._in_cells(place_m), yaw), arrivals, grid)
+        return GridScan(*self._ways(occupied, self._in_cells(place_m), yaw), arrivals, grid)
 
     def is_floor(self, pose: Array, ranges_m: Array) -> Flags:
         """Return the bins (N, DIRECTIONS) about the viewpoint, at ranges (N,), whose cells are floor by all pairs.
@@ -242,14 +243,14 @@ class ObstacleGrid:
         cells (SIDE, SIDE): probability of a thing, 2 where nothing is known.
         """
         count = round(self._max_range_m / CELL_M)
-        ranges_m, taken = STEPS_M[:count], cells[_along(place, yaw_rad)][:, :count].astype(float)
+        ranges_m, occupied = STEPS_M[:count], cells[_along(place, yaw_rad)][:, :count].astype(float)
         # 1. Free is up to where the probability that a thing stands on the way is at most the risk.
-        has_ended = 1 - np.cumprod(1 - np.minimum(taken, 1), axis=1) > RISK
+        has_ended = 1 - np.cumprod(1 - np.minimum(occupied, 1), axis=1) > RISK
         free_m = np.where(has_ended.any(axis=1), has_ended.argmax(axis=1) * CELL_M, self._max_range_m)
         # 2. The first cells in a row in which a thing is more likely than not.
-        is_thing = (taken > 0.5) & (taken <= 1)
+        is_thing = (occupied > 0.5) & (occupied <= 1)
         has_passed = np.logical_or.accumulate(is_thing, axis=1) & ~is_thing
-        weight = np.where(is_thing & ~np.logical_or.accumulate(has_passed, axis=1), taken, 0.0)
+        weight = np.where(is_thing & ~np.logical_or.accumulate(has_passed, axis=1), occupied, 0.0)
         total = weight.sum(axis=1)
         with np.errstate(invalid="ignore"):
             hit_m = weight @ ranges_m / total
@@ -259,37 +260,37 @@ class ObstacleGrid:
         sigma_m = np.sqrt(variance + CELL_M**2 / 12)
         return hit_m.astype(np.float32), sigma_m.astype(np.float32), free_m.astype(np.float32)
 
-    def _flooded(self, hidden: Flags, rays: Rays) -> Bytes:
+    def _hidden_before(self, hidden: Flags, rays: Rays) -> Bytes:
         """Return the cells (1) before the nearest floor in view, hidden (SIDE, SIDE) where it was seen, of ways on
         which nothing is known that hides it; rays: of the viewpoint."""
-        flooded = np.zeros((SIDE, SIDE), np.uint8)
+        possible = np.zeros((SIDE, SIDE), np.uint8)
         candidates = hidden & (self._was_past > 0)
         if not candidates.any():
-            return flooded
-        taken = self._taken()[rays]
-        explained = ((taken > 0.3) & (taken <= 1) & (self._near_m + 3 * CELL_M > STEPS_M)).any(axis=1)
+            return possible
+        occupied = self._occupied()[rays]
+        explained = ((occupied > 0.3) & (occupied <= 1) & (self._near_m + 3 * CELL_M > STEPS_M)).any(axis=1)
         explained = np.any([np.roll(explained, shift) for shift in range(-2, 3)], axis=0)
         rows, columns = (of[~explained][:, self._near_m > STEPS_M] for of in rays)
-        flooded[rows, columns] = candidates[rows, columns]
-        return _without_specks(flooded)
+        possible[rows, columns] = candidates[rows, columns]
+        return _without_specks(possible)
 
-    def _arrivals(self, passed_s: float, rays: Rays, taken: Floats, shows: Flags, flooded: Bytes) -> Arrivals:
-        """Return who has come onto floor that was free a short while ago.
+    def _arrivals(self, passed_s: float, rays: Rays, occupied: Floats, shows: Flags, possible: Bytes) -> Arrivals:
+        """Return what has come onto floor that was free a short while ago.
 
-        rays: of the viewpoint; taken (SIDE, SIDE): probability of a thing; shows: where this pair shows one; flooded: 1
+        rays: of the viewpoint; occupied (SIDE, SIDE): probability of a thing; shows: this pair shows one; possible: 1
         where one may that hides the nearest floor.
         """
         p = self._p
         self._free_s += np.float32(passed_s)
         lately = self._free_s < p.lately_s
-        self._free_s[taken < 1 / (1 + math.exp(-p.prior))] = 0
-        # Who comes is wider than a speck of noise.
+        self._free_s[occupied < 1 / (1 + math.exp(-p.prior))] = 0
+        # What has come is wider than a speck of noise.
         around, is_most = self._hanging()
-        came = ((taken > 0.5) & (taken <= 1)) | (flooded > 0) | ((around > p.shown_comes) & is_most)
-        came |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
+        arrived = ((occupied > 0.5) & (occupied <= 1)) | (possible > 0) | ((around > p.arrival_surface) & is_most)
+        arrived |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
         # The first one of each direction, before floor that was free, by the noise of stereo and more.
-        first = came[rays].argmax(axis=1)
-        ranges_m = np.where(came[rays].any(axis=1), STEPS_M[first], np.nan)
+        first = arrived[rays].argmax(axis=1)
+        ranges_m = np.where(arrived[rays].any(axis=1), STEPS_M[first], np.nan)
         before_m = p.behind_m + 1.5 * ranges_m**2 / self._at_1m
         end = np.nan_to_num(first + np.ceil(before_m / CELL_M), nan=SIDE).astype(np.intp)
         others = np.cumsum(np.pad(~lately[rays], ((0, 0), (1, 0))), axis=1)
@@ -298,7 +299,7 @@ class ObstacleGrid:
         for run in runs(np.isfinite(ranges_m)):
             # Who hides the nearest floor in view stands next to the base.
             range_m = float(ranges_m[run].mean())
-            least_rad = p.comes_m / range_m if range_m > self._near_m else p.person_rad
+            least_rad = p.arrival_m / range_m if range_m > self._near_m else p.person_rad
             if len(run) * math.tau / SECTORS < least_rad:
                 ranges_m[run] = np.nan
         is_nearer = ranges_m < self._near_m
@@ -320,7 +321,7 @@ class ObstacleGrid:
         reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
         free = self._ranges_m < reach_m[np.floor(columns + 0.5).astype(np.intp) % count]
         self._known[free], self._past_views[free] = 1, p.views
-        self.odds[free & (self.odds < 0)] = p.arrival
+        self.odds[free & (self.odds < 0)] = p.least
 
     def _hides(self, belief: RayBelief) -> Flags:
         """Return the directions (D,) in which the nearest floor in view is hidden."""
@@ -329,21 +330,21 @@ class ObstacleGrid:
         three = (np.roll(hidden, 1) + hidden + np.roll(hidden, -1)) / 3
         return np.asarray((three > 0.5) & (belief.view[:, 0] > 0))
 
-    def _taken(self) -> Floats:
+    def _occupied(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
         p, (around, is_most) = self._p, self._hanging()
-        hanging = np.clip(p.shown_weight * (around - p.shown_least), -9.0, 6.0) + np.float32(p.prior)
-        hanging[~is_most] = p.arrival
-        taken = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
-        return np.where((self._known > 0) | (self.odds > 0), taken, np.float32(2))
+        hanging = np.clip(p.hanging_weight * (around - p.hanging_least), -9.0, 6.0) + np.float32(p.prior)
+        hanging[~is_most] = p.least
+        occupied = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
+        return np.where((self._known > 0) | (self.odds > 0), occupied, np.float32(2))
 
     def _hanging(self) -> tuple[Floats, Flags]:
-        """Return the mean of what single pairs show around cells, and whether a cell shows at least as much: there
-        hangs what is shown around."""
-        around = np.asarray(cv2.blur(self._shown, (5, 5)), np.float32)
-        return around, self._shown >= around
+        """Return the mean surface (SIDE, SIDE) that pairs show around cells, and the cells that show at least as much:
+        what hangs is there."""
+        around = np.asarray(cv2.blur(self._surface, (5, 5)), np.float32)
+        return around, self._surface >= around
 
-    def _who_comes(self, passed_s: float, watched: Flags) -> None:
+    def _spread_unknown(self, passed_s: float, visible: Flags) -> None:
         """Spread what is not known through cells that nobody sees."""
         p = self._p
         self._carry += p.walk_mps * passed_s / CELL_M
@@ -351,7 +352,7 @@ class ObstacleGrid:
         self._carry -= steps
         person = np.ones((p.person_cells, p.person_cells), np.uint8)
         wide = np.asarray(
-            cv2.morphologyEx((~watched & (self.odds <= 0)).view(np.uint8), cv2.MORPH_OPEN, person), np.uint8
+            cv2.morphologyEx((~visible & (self.odds <= 0)).view(np.uint8), cv2.MORPH_OPEN, person), np.uint8
         )
         source = wide & (self._known == 0)
         for step in range(min(steps, SIDE)):

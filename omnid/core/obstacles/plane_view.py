@@ -57,9 +57,9 @@ NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
 # Rows on either side of those in which the floor has a disparity. Measured: with 1, 2 and 3 of them 10.5, 11.1 and 11.8
 # % of the directions of things are called free beyond these, and 93.7, 94.9 and 95.8 % of open ones up to 1.5 m.
 BIN_ROWS: Final = 2
-# Least difference of disparity by which something is not the floor. Measured: 0.87 to 1.95 are alike.
+# Least difference of disparity by which something is not the floor. Measured: 0.87 to 1.95 change nothing.
 FLOOR_PX: Final = 1.3
-# Lower and higher disparities than the floor's that may explain its rows. Measured: two thirds to 1.5 times are alike.
+# Lower and higher disparities than the floor's that may explain its rows. Two thirds to 1.5 times change nothing.
 OTHERS_PX: Final = (12, 25)
 EDGE_M: Final = 0.05  # least fall of the floor that is an edge, because the base's wheels pass lower ones
 LEVEL_STEP_PX: Final = 0.375  # between planes below the floor, because matching resolves that

@@ -149,7 +149,7 @@ def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
     z = np.asarray(contrast - np.median(contrast[near]), np.float32)
     sigma = np.float32(max(_sigma_of(z[near]), 0.25))
     anything = _noise(contrast - 1, np.float32(1.3), 0.0)
-    by_contrast = _alike(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0), anything)
+    by_contrast = _ratio_of_look(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0), anything)
     # 2. The difference to both sides, of a bin or of five, whichever is less. A thing shows an outline in half of its
     #    directions.
     side = turned(greys, SIDE)
@@ -157,7 +157,7 @@ def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
     five = cv2.blur(one, (1, 5))
     outline = np.asarray(np.where(np.abs(one) < np.abs(five), one, five), np.float32)
     core = _noise(outline, np.float32(max(_sigma_of(outline[near]), 0.8)) * np.sqrt(far), P.tail)
-    by_outline = _alike(core, np.float32(0.5) * (core + _laplace(np.abs(outline), scale)))
+    by_outline = _ratio_of_look(core, np.float32(0.5) * (core + _laplace(np.abs(outline), scale)))
     # 3. The grey, by that of the floor at the same range where it is known.
     middles = np.full((len(greys), 1), grey, np.float32)
     sigmas = np.full_like(middles, max(_sigma_of(greys[near] - grey), P.grey_share * grey))
@@ -166,7 +166,7 @@ def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
     of_rows = MAD * _row_medians(np.abs(greys[known] - middles[known]), near[known])
     sigmas[known, 0] = np.clip(of_rows, P.near_grey_share * grey, sigmas[known, 0])
     z = greys - middles
-    by_grey = _alike(_noise(z, sigmas, 0.0), _laplace(np.abs(z), 1.5 * scale))
+    by_grey = _ratio_of_look(_noise(z, sigmas, 0.0), _laplace(np.abs(z), 1.5 * scale))
     # Far away the light of the near floor is all that is known.
     lowest = P.look_low * (1 + known[:, None])
     total = np.clip(by_contrast, P.look_low, P.look_high) + np.clip(by_outline, P.look_low, P.look_high)
@@ -187,7 +187,7 @@ def _laplace(magnitudes: Floats, scale: Floats | np.float32) -> Floats:
     return np.asarray(np.exp(-magnitudes / scale) / (2 * scale) + LEAST, np.float32)
 
 
-def _alike(core: Floats, anything: Floats) -> Floats:
+def _ratio_of_look(core: Floats, anything: Floats) -> Floats:
     """Return the log-ratio of a feature of the floor, of which a tenth shows anything, to that of anything."""
     return np.asarray(np.log(0.9 * core / anything + 0.1), np.float32)
 

@@ -24,7 +24,7 @@ class RayParameters(NamedTuple):
     steps_per_m: float = 0.005
     changes_per_m: float = 0.02  # of borders behind which the floor looks otherwise
     # Probabilities.
-    alike: float = 0.1  # something looks like the floor
+    similar: float = 0.1  # something looks like the floor
     invisible: float = 0.005  # the end of the floor beyond the last bin shows no foot
     nearer: float = 0.02  # something begins nearer than the view and looks like the floor; and otherwise
     marks: float = 0.02  # m: an edge in a bin of the floor, before any was seen
@@ -111,7 +111,7 @@ def posterior(
         prior_odds[n] = math.log(prior / (1.0 - prior))
     log_things, log_over = math.log(p.things_per_m), math.log(p.rare_per_m)
     log_steps, log_slopes = math.log(p.steps_per_m), math.log(p.rare_per_m)
-    log_alike, log_unlike = math.log(p.alike), math.log1p(-p.alike)
+    log_similar, log_other_look = math.log(p.similar), math.log1p(-p.similar)
     other_at_start = min(0.1 * p.changes_per_m * nearest_m, 0.5)
     log_known, log_other = math.log1p(-other_at_start), math.log(other_at_start)
     log_nearer, log_2 = math.log(p.nearer), math.log(2.0)
@@ -131,8 +131,8 @@ def posterior(
         before, slope, as_known, other_look, looks = 0.0, -1e9, log_known, log_other, 0.0
         for n in range(bins):
             own = terms[EDGE, n - 1, u] if n else 0.0  # a step reaches into the bin before
-            alike = log_sum(log_alike + min(max(look[n], -30.0), 30.0), log_unlike)
-            here = before + looks - own + terms[BEGINS, n, u] + alike + math.log1p(later[min(n + APART, bins)])
+            similar = log_sum(log_similar + min(max(look[n], -30.0), 30.0), log_other_look)
+            here = before + looks - own + terms[BEGINS, n, u] + similar + math.log1p(later[min(n + APART, bins)])
             here += log_length[n]
             upright[n] = here + terms[FITS, n, u] + log_things
             steps[n] = here + log_sum(down[n], up[n]) + log_steps
@@ -204,7 +204,7 @@ def gather(
     ratios, view, surface (D, K): of a RayBelief; near (D,): 1 where the nearest floor in view is seen, 2 where
     something hides it, 0 where nothing is in view; ends (K + 1,): ranges of the bins.
     ranges [m], at (N, N): ranges and directions of the cells, from the viewpoint, up to reach_m.
-    A cell is as taken as the most taken of the bins and directions in it: a pole fills no cell.
+    A cell has the largest ratio of the bins and directions in it: a pole fills no cell.
     """
     directions, bins = ratios.shape
     by_angle, row = directions / math.tau, np.empty(2 * MOST_BESIDE + 2)
@@ -240,17 +240,17 @@ def gather(
             run = max(min(round(THIN_M / r * by_angle), last - first + 1), 1)
             most, least, total, together, seen = -99.0, 1.0, 0.0, 0.0, 0
             for u in range(first, last + 1):
-                at_u, taken, shown, is_seen = u % directions, 0.0, 0.0, False
+                at_u, ratio, shown, is_seen = u % directions, 0.0, 0.0, False
                 for k in range(begin, end + 1):
                     if view[at_u, k] > 0:
-                        taken = max(taken, ratios[at_u, k]) if is_seen else ratios[at_u, k]
+                        ratio = max(ratio, ratios[at_u, k]) if is_seen else ratios[at_u, k]
                         is_seen = True
                     shown = max(shown, surface[at_u, k])
                     least = min(least, view[at_u, k])
                 seen += is_seen
                 total += min(max(shown - 0.4, 0.0), 1.5)
-                row[u - first] = taken
-                together += taken
+                row[u - first] = ratio
+                together += ratio
                 if u - first >= run:
                     together -= row[u - first - run]
                 if u - first >= run - 1:

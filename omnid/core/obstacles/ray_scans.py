@@ -7,7 +7,7 @@ and changes nothing. Only floor nearer than where a step down looks like a tilt 
 
 A ramp of slope s that begins x_0 ahead lies on a plane of its own: z = -(h + s x_0) + r (a + s) cos(u), about the
 viewpoint, over a floor z = -h + r a cos(u). So it has a disparity in each row, too, and both planes are compared, pixel
-by pixel, in the rows beyond the line. Of all (x_0, s) the likeliest is taken, where it explains those rows better than
+by pixel, in the rows beyond the line. Of all (x_0, s) the likeliest is chosen, where it explains those rows better than
 the floor, and than anything upright, in most directions: what is narrower than the way, such as a box, is no ramp, and
 neither is a wall.
 A ramp goes up by at most what may be driven; and down by at most what the base has climbed: a landing. Any other fall
@@ -56,9 +56,9 @@ LEAST_RAD: Final = math.radians(0.15)  # change of a tilt for which tables are m
 LEAST_M: Final = 0.005  # and of a height
 CORRELATED: Final = 20.0  # pixels with one error: neighbours are smoothed, and share what is wrong
 HALF_BASE_M: Final = 0.5  # From a line so far on, a base stands with all wheels on one side of it.
-FOUND_M: Final = 1.0  # A ramp that begins nearer is known: what is left of the floor before it tells no start.
+FOUND_M: Final = 1.0  # A ramp that begins nearer is known: too little floor is left before it to show a start.
 STEEPEST: Final = math.tan(math.radians(10.0))  # ramp that may be driven,
-TOO_STEEP: Final = np.tan(np.radians(np.arange(12.0, 21.0, 2.0)))  # and others, for which it must not be taken
+TOO_STEEP: Final = np.tan(np.radians(np.arange(12.0, 21.0, 2.0)))  # and others, with which it must not be confused
 GENTLEST: Final = math.tan(math.radians(1.0))  # The filter of the tilt follows what is less.
 STEP: Final = math.tan(math.radians(0.5))  # between slopes that are compared
 STARTS_M: Final = np.arange(0.6, 3.3, 0.1)  # where ramps are looked for: nearer ones are known by their pairs before

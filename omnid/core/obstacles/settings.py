@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from omnid.errors import OmnidError
 
-LEAST_HEIGHT_M: Final = 0.02  # A plane so little above the floor is the floor, because matching tells no more apart.
+LEAST_HEIGHT_M: Final = 0.02  # Matching cannot distinguish a plane from a floor so little below it.
 
 
 @dataclass(frozen=True, slots=True)
