@@ -68,8 +68,6 @@ PARTS: Final = 8  # of that angle: most of them must show a ramp
 # Log-likelihood by a sigma of difference of a pixel: that of evidence_kernels.py with its weight in the posterior.
 RATIO: Final = 0.075
 LEAST_NATS: Final = 10.0  # Evidence of a ramp in one pair: without one it is below 4 in textured corridors.
-SAME_M, SAME = 0.5, math.tan(math.radians(3.0))  # within which pairs show the same ramp
-VIEWS: Final = 3.0  # Pairs that count: nearer ones show a ramp better.
 
 
 class Ramp(NamedTuple):
@@ -78,21 +76,11 @@ class Ramp(NamedTuple):
     way_rad: float  # azimuth of the way
     offset_m: float  # of the line along the way
     slope: float  # along the way, against the floor before the line
-    nats: float  # evidence of it, by all pairs
+    nats: float  # evidence of it in one pair
 
     def start_m(self, viewpoint: Array) -> float:
         """Return how far the line is from a viewpoint (x, y, heading) along the way; below 0: behind."""
         return self.offset_m - _along(viewpoint, self.way_rad)
-
-    def joined(self, found: Ramp) -> Ramp:
-        """Return the mean with what a pair shows, weighted by the evidence; or that, where it is another ramp."""
-        is_same = abs(found.offset_m - self.offset_m) < SAME_M and abs(found.slope - self.slope) < SAME
-        if not is_same or math.cos(found.way_rad - self.way_rad) < math.cos(HALF_RAD):
-            return found
-        nats = min(self.nats, (VIEWS - 1) * found.nats) + found.nats
-        share = found.nats / nats
-        offset_m = self.offset_m + share * (found.offset_m - self.offset_m)
-        return Ramp(self.way_rad, offset_m, self.slope + share * (found.slope - self.slope), nats)
 
 
 def _along(viewpoint: Array, way_rad: float) -> float:
@@ -212,11 +200,11 @@ class RayScans:
         # A rig that leans shows a slope everywhere.
         if is_due and np.diag(self._P).max() < SURE_RAD**2 and start_m > FOUND_M:
             found = ramp_ahead(pair, self._floor, viewpoint, turn_rad, float(T_odom_base[2, 0]))
-            if found is not None:
-                self._ramp = found if ramp is None else ramp.joined(found)
-            if found is not None and self._ramp is found:
-                # What was seen beyond its start was compared with another floor.
-                self.grid.forget_beyond(found.way_rad, found.offset_m)
+            # A nearer pair shows it better.
+            if found is not None and (ramp is None or found.nats > ramp.nats):
+                self._ramp = found
+                if ramp is None:  # What was seen beyond its start was compared with another floor.
+                    self.grid.forget_beyond(found.way_rad, found.offset_m)
         return scan
 
     def _observe_tilt(self, pose: Array, pair: WorkingPair, start_m: float, way_rad: float) -> None:
