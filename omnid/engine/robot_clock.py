@@ -57,9 +57,15 @@ class RobotClock:
         self._report(f"the computer's clock {how}: stamps follow it, a recording goes on in a new file")
 
     def _measured(self) -> tuple[int, int, int]:
-        """Return the largest error of an offset, the offset, and the time of both [ns]."""
-        before_ns, unix_ns, after_ns = self.monotonic_ns(), self._unix_ns(), self.monotonic_ns()
-        return after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2, after_ns
+        """Return the largest error of an offset, the offset, and the time of both [ns]; of three the most exact one.
+
+        A reading that is interrupted would move the stamps of a recording against each other.
+        """
+        readings = []
+        for _ in range(3):
+            before_ns, unix_ns, after_ns = self.monotonic_ns(), self._unix_ns(), self.monotonic_ns()
+            readings.append((after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2, after_ns))
+        return min(readings)
 
     def _offset_ns(self, stamp_ns: int) -> int:
         """Return the offset from a stamp to Unix time, as it was last measured before the stamp."""
