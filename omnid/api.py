@@ -113,7 +113,7 @@ class Odometry:
     def process(
         self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None = None
     ) -> OdometryUpdate:
-        """Return the pose at a pair of grey images (H, W) uint8 that were taken at stamp_ns, in ns of any clock.
+        """Return the pose at a pair of grey images (H, W) uint8 that were captured at stamp_ns, in ns of any clock.
 
         upper_stamp_ns: of the upper image, in the same clock, where the cameras are not synchronised; the motion in
         between is then corrected as in a replay. None: both images are synchronised.

@@ -46,8 +46,8 @@ class CamerasConfig:
     ] = 16
     auto_exposure: Annotated[
         Literal["keep", "on", "off", "rig"],
-        "automatic exposure; 'rig': omnid run sets exposure and gain of both cameras "
-        "alike, by what the mirrors show without the black corners; where they cannot be set, "
+        "automatic exposure; 'rig': omnid run sets the same exposure and gain for both cameras, "
+        "by what the mirrors show without the black corners; where they cannot be set, "
         "and in other commands, as 'on'; 'on': each camera's own; 'keep': as it is",
     ] = "rig"
     exposure_limit_ms: Annotated[
@@ -98,11 +98,11 @@ class LogConfig:
     rate_hz: Annotated[
         float,
         Meta(ge=0, le=1000),
-        "images per second of folders; 0: their names or times.txt state when they were taken",
+        "images per second of folders; 0: their names or times.txt state the times of capture",
     ] = 0.0
     time: Annotated[
         TimeSource,
-        "when an image was taken: 'header': the stamp of its message, 'log': the time of logging, 'auto': the "
+        "time of capture of an image: 'header': the stamp of its message, 'log': the time of logging, 'auto': the "
         "header's, or the log's where one of those is not set",
     ] = "auto"
 

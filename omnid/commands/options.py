@@ -225,7 +225,7 @@ CAMERAS: Final = """
 LOG: Final = f"{RIG}{CAMERAS}{RATE}"
 LOG_CAMERAS: Final = f"""{CAMERAS}
 --bits 8|10|12|16=16         bits of the cameras in images of 16 bits a sample
---time auto|header|log=auto  when an image was taken: as log.time of the settings
+--time auto|header|log=auto  time of capture of an image: as log.time of the settings
 {RATE}
 """
 

@@ -1,4 +1,4 @@
-"""Counters of a run, what is wrong with its input, and the numbers of the parts of a live run (`status_names`)."""
+"""Counters of a run, warnings about its input, and the status of the parts of a live run (`status_names`)."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ class RunStatistics:
 
     def __init__(self, clock: RobotClock | None = None) -> None:
         """clock: of the stamps of a live run, which measures how long its poses take; None: the run is over a log."""
-        self.to_pose, self._clock = Histogram(), clock  # from the stamp of a pair to its pose [s]
+        self.latency, self._clock = Histogram(), clock  # from the stamp of a pair to its pose [s]
         self.poses = 0
         self.length_m = 0.0
         self.states: Counter[str] = Counter()
         self.resets = 0
-        self.dark = 0  # pairs that were too dark
+        self.dark_pairs = 0
         self.lost_parts: Counter[Side] = Counter()  # pairs in which a part of a camera's image was frozen or blind
         self.newest: OdometryUpdate | None = None
         self._position: NDArray[np.float64] | None = None
@@ -52,15 +52,15 @@ class RunStatistics:
     def process(self, odometry: OdometryUpdate) -> None:
         """Count a pose."""
         if self._clock is not None:
-            self.to_pose.add((self._clock.monotonic_ns() - odometry.stamp_ns) * S_PER_NS)
-        # 1. The way.
+            self.latency.add((self._clock.monotonic_ns() - odometry.stamp_ns) * S_PER_NS)
+        # 1. The length of the path.
         position = odometry.T_odom_rig[:3, 3]
         if self._position is not None:
             self.length_m += float(np.linalg.norm(position - self._position))
         self._position, self.newest = position, odometry
         # 2. States of poses and images.
         self.states[odometry.state] += 1
-        self.dark += odometry.light.is_too_dark
+        self.dark_pairs += odometry.light.is_too_dark
         columns = odometry.depth.panoramas.tiles.columns
         self.lost_parts.update(side for side, found in columns.items() if found.any())
         self.resets = odometry.reset_counter
@@ -143,7 +143,7 @@ def show_progress(statistics: RunStatistics, expected: int | None, ended: bool) 
 def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
     """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
     stats: dict[str, Any] = pairing.stats()
-    poses, states, dark = statistics.poses, statistics.states, statistics.dark
+    poses, states, dark = statistics.poses, statistics.states, statistics.dark_pairs
     lost, degraded, notable = states[TrackingState.LOST], states[TrackingState.DEGRADED], NOTABLE_SHARE * poses
     unpaired = min(stats["unpaired_lower"], stats["unpaired_upper"])
     # 1. Images and their stamps.
@@ -176,7 +176,7 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
                 f"a part of the {side} camera's image was frozen, dark, saturated or blurred in {parts} of {poses} "
                 "pairs: clean the mirror, check the camera and its driver"
             )
-    # 3. Poses that are not sure.
+    # 3. Poses that are lost or degraded.
     if lost + degraded > poses / 2:
         yield (
             f"the pose was lost in {lost} of {poses} pairs, degraded in {degraded}: is the rig that of these cameras, "
@@ -241,7 +241,7 @@ class StatusCollector:
             Key.RUN: status_names.RUN_ID,
             Key.RESETS: newest.reset_counter,
             "length_m": self._statistics.length_m,
-            **times(status_names.CAPTURE_TO_POSE, self._statistics.to_pose),
+            **times(status_names.CAPTURE_TO_POSE, self._statistics.latency),
             **({"_stale": "no new pose"} if age_s > TIMEOUT_S else {severity: f"{state}: {fault}" if fault else state}),
         }
 
@@ -250,7 +250,7 @@ class StatusCollector:
         stats: dict[str, Any] = pair.stats()
         missing = [name for name, stamp_ns in pair.newest_ns.items() if not self._age_s(stamp_ns) <= TIMEOUT_S]
         pairs_hz, broken_hz = (self._rate_hz(name, pair.counts[name]) for name in ("pairs", "broken"))
-        taken_hz, dropped_hz = (
+        processed_hz, dropped_hz = (
             self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
         )
         frozen = stats["_frozen"]
@@ -259,7 +259,7 @@ class StatusCollector:
             f"images cannot be decoded; the first: {stats['_fault']}": broken_hz > 0,
             f"the images of the {frozen} camera are frozen: check the camera and its driver": frozen,
             "too slow: the computer leaves images out; close other programs, or start omnid with --profile small": (
-                dropped_hz > NOTABLE_SHARE * (taken_hz + dropped_hz)
+                dropped_hz > NOTABLE_SHARE * (processed_hz + dropped_hz)
             ),
             "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them": pairs_hz == 0,
         }
@@ -281,8 +281,8 @@ class StatusCollector:
 
 def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> Stats:
     """Return the counters and times of the controller, whether the wheels turn, and why they do not."""
-    state = controller.state  # read once, for another thread replaces it
-    # 1. Why they stand or are slow; a controller that has failed is an error, one that is awaited is none.
+    state = controller.state  # Read once, because another thread replaces it.
+    # 1. Why the wheels are stopped or slow. A controller that has failed is an error, one that is awaited is not.
     stop = state.disarmed_by if state.reason == NOT_ARMED else state.reason
     slow = "" if state.reason else state.slowed_by or state.obstacle
     words = stop or (f"driving slowly: {slow}" if slow else "driving")

@@ -48,43 +48,37 @@ def tested_drive(
         )
     if ask(BEFORE).lower() != "yes":
         raise OmnidError("not begun: only `yes` starts the motors")
-    # Each motor turns alone, forwards and back: its wheel, and the direction of that.
+    # Each motor turns alone, forwards and back.
     drive = replace(config.drive, swapped=False, reverse_left=False, reverse_right=False)
     with ExitStack() as closing:
         motor = open_motor(replace(config, drive=drive), closing)
-
-        def motion(channel: int) -> None:
-            turn = -1.0 if channel == 1 else 1.0  # the command of the other wheel becomes 0
-            for sign in (1, -1):
-                velocity_mps, yaw_rate_radps = sign * speed_mps / 2, sign * turn * speed_mps / drive.track_m
-                # After a pause the driver sends a stop in place of the first command.
-                _send(motor, stop_command(0), 0.0, config.rate_hz)
-                _send(motor, VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps), MOVE_S, config.rate_hz)
-                _send(motor, stop_command(0), REST_S, config.rate_hz)
-
-        turned_deg = math.degrees(speed_mps * MOVE_S / drive.wheel_radius_m)
-        seen = [_seen(channel, turned_deg, motion, ask) for channel in (1, 2)]
-    first, forwards = seen[0][0], dict(seen)
-    if len(forwards) == 1:
-        raise OmnidError(f"both motors turned the {first} wheel, which cannot be: begin again")
-    reverse_left, reverse_right = (not forwards[side] for side in ("left", "right"))
-    return replace(drive, swapped=first == "right", reverse_left=reverse_left, reverse_right=reverse_right)
+        first_side, is_first_forwards = _turned_wheel(motor, 1, config, speed_mps, ask)
+        second_side, is_second_forwards = _turned_wheel(motor, 2, config, speed_mps, ask)
+    if first_side == second_side:
+        raise OmnidError(f"both motors turned the {first_side} wheel, which cannot be: begin again")
+    forwards = {first_side: is_first_forwards, second_side: is_second_forwards}
+    reverse_left, reverse_right = not forwards["left"], not forwards["right"]
+    return replace(drive, swapped=first_side == "right", reverse_left=reverse_left, reverse_right=reverse_right)
 
 
-def _seen(
-    channel: int, turned_deg: float, motion: Callable[[int], None], ask: Callable[[str], str]
+def _turned_wheel(
+    motor: MotorDriver, channel: int, config: MotorSettings, speed_mps: float, ask: Callable[[str], str]
 ) -> tuple[str, bool]:
-    """Turn one motor; return the side of the wheel that moved, and whether a positive command turned it forwards.
-
-    turned_deg: by which the wheel turns one way, where the gear is right.
-    """
+    """Turn one motor; return the side of the wheel that moved, and whether a positive command turned it forwards."""
+    turned_deg = math.degrees(speed_mps * MOVE_S / config.drive.wheel_radius_m)  # one way, where the gear is right
+    yaw_sign = -1.0 if channel == 1 else 1.0  # With this turn, the command of the other wheel is 0.
     question = (
         f"Motor {channel} turned its wheel by {turned_deg:.0f} deg and back, or motor.drive.gear is wrong. Name the "
         "wheel that moved (l left, r right, n none or both, a again): "
     )
     side = None
     while side is None:
-        motion(channel)
+        for sign in (1, -1):
+            velocity_mps, yaw_rate_radps = sign * speed_mps / 2, sign * yaw_sign * speed_mps / config.drive.track_m
+            # After a pause the driver sends a stop in place of the first command.
+            _send(motor, stop_command(0), 0.0, config.rate_hz)
+            _send(motor, VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps), MOVE_S, config.rate_hz)
+            _send(motor, stop_command(0), REST_S, config.rate_hz)
         letter = ask(question)[:1].lower()
         if letter == "n":
             raise OmnidError(

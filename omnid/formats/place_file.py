@@ -16,17 +16,11 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.places.features import COLUMNS, DESCRIPTOR, ROWS
-from omnid.core.places.place_map import (
-    Link,
-    PlaceFeatures,
-    PlaceKeyframe,
-    PlaceMap,
-    PlaceRig,
-)
+from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
 from omnid.errors import OmnidError
 from omnid.formats.exports import replaced
 
-FORMAT: Final = 8  # to be raised where what is kept of a place changes: old maps fit no more
+FORMAT: Final = 8  # To be raised when the arrays change; maps of other versions are refused.
 _POSE: Final = ("<f8", (3, 4))  # the upper rows of a transform
 _COVARIANCE: Final = ("<f8", (6, 6))
 _RANGE: Final = ("<f2", (SECTORS,))
@@ -91,10 +85,11 @@ def _to_arrays(places: PlaceMap, rig: PlaceRig) -> _Arrays:
     head = FORMAT, places.dropped, cylinder.width, cylinder.height, cylinder.row0, rig.baseline_m, *poses
     keyframes = []
     for id in ids:
-        its = places.keyframes[id]
-        numbers = id, its.session, its.stamp_ns, len(its.features.views)
-        poses = places.poses[id][:upper], its.T_odom_rect[:upper]
-        keyframes.append((*numbers, *poses, its.covariance, its.thumbnail, its.scan, its.free_m))
+        keyframe = places.keyframes[id]
+        numbers = id, keyframe.session, keyframe.stamp_ns, len(keyframe.features.views)
+        poses = places.poses[id][:upper], keyframe.T_odom_rect[:upper]
+        images = keyframe.thumbnail, keyframe.scan, keyframe.free_m
+        keyframes.append((*numbers, *poses, keyframe.covariance, *images))
     links = [(link.a, link.b, link.inliers, link.T_a_b[:upper], link.covariance) for link in places.links]
     rows = {"map": [(*head, rig.rig_hash.encode())], "keyframes": keyframes, "links": links}
     arrays = {name: np.array(found, _ARRAYS[name]) for name, found in rows.items()}
@@ -111,8 +106,8 @@ def _from_arrays(arrays: _Arrays) -> tuple[PlaceMap, PlaceRig]:
     T_map_rect, T_odom_rect = _transforms(keyframes["T_map_rect"]), _transforms(keyframes["T_odom_rect"])
     ends = np.cumsum(keyframes["features"]).tolist()
     for row, T, T_odom, end in zip(keyframes, T_map_rect, T_odom_rect, ends, strict=True):
-        id, its = int(row["id"]), slice(end - int(row["features"]), end)
-        features = PlaceFeatures(arrays["descriptors"][its].copy(), arrays["views"][its].copy())
+        id, own = int(row["id"]), slice(end - int(row["features"]), end)
+        features = PlaceFeatures(arrays["descriptors"][own].copy(), arrays["views"][own].copy())
         covariance, thumbnail, scan, free_m = (
             np.array(row[name]) for name in ("covariance", "thumbnail", "scan", "free_m")
         )

@@ -57,7 +57,7 @@ class RobotState:
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
         self.poses = self.missed = self.broken = 0
-        self.recent: deque[Pose] = deque(maxlen=_RECENT)  # newest poses of the run: what is seen from one comes later
+        self.recent: deque[Pose] = deque(maxlen=_RECENT)  # newest poses of the run: a scan arrives after its pose
         self._arrivals_s: deque[float] = deque(maxlen=_RECENT)
 
     def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
@@ -212,8 +212,8 @@ def status_table(robot: str, state: RobotState) -> Iterator[str]:
 def reports_of(robot: Robot, command_ns: int) -> Iterator[NavigationReport]:
     """Yield the reports of the drive that a request with this stamp began, and last the one with which it ended.
 
-    That is one of another request where that has taken the place of this one. Raise OmnidError where the robot is
-    silent for SILENCE_S.
+    The last report is that of another request if that has replaced this one. Raise OmnidError if the robot sends none
+    for SILENCE_S.
     """
     begun, deadline_s = False, time.monotonic() + SILENCE_S
     with robot.subscribe(NavigationReport) as reports:
@@ -232,10 +232,10 @@ def reports_of(robot: Robot, command_ns: int) -> Iterator[NavigationReport]:
 
 
 def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = None) -> bool:
-    """Stop the robot, and go on until its status confirms it; False where it has not in time.
+    """Repeat a stop until the robot's status confirms it; False if it has not within answer_s.
 
-    It goes as a datagram first, which needs no place among the sessions of the bus, and over the bus where that is not
-    answered: over a connection that there is, else over a new one. Raise OmnidError where the robot cannot be reached.
+    A datagram is tried first, because it needs no session of the bus. If the robot does not answer it, the stop goes
+    over the bus: by the given connection, else by a new one. Raise OmnidError where the robot cannot be reached.
     """
     deadline_s = time.monotonic() + answer_s
     with closing(StopSender(bus.robot, bus.connect or (HERE,))) as datagrams:
@@ -247,7 +247,7 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = 
         ):
             driver = robot.driver()
             driver.require_connected()
-            statuses.newest()  # The one that the robot has kept is from before this stop.
+            statuses.newest()  # Discard the status that the bus has kept: it is from before this stop.
             while time.monotonic() < deadline_s:
                 driver.stop()
                 report = statuses.wait(REPEAT_S)

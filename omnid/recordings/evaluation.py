@@ -23,7 +23,7 @@ class Metrics:
     coverage: float  # share of the truth's poses that have an estimate, 0..1
     length_estimate_m: float
     length_truth_m: float
-    length_error_ratio: float  # (estimate - truth) / truth; negative: too short; NaN where the truth stands still
+    length_error_ratio: float  # (estimate - truth) / truth; negative: too short; NaN where the truth does not move
     ate_rmse_m: float  # absolute position error
     ate_max_m: float
     end_error_m: float

@@ -270,7 +270,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
 
 
 def _answer_arming(bus: Bus, state: ControllerState) -> None:
-    """Answer the newest request to arm, and those before it, which happens once."""
+    """Answer the newest request to arm and those before it; each is answered once."""
     answer = state.arm_answer
     text = answer.refusal or "armed: it obeys commands from now on"
     if answer.refusal == AWAITED:

@@ -1,4 +1,4 @@
-"""Recording of a run to MCAP logs: images as they came, poses, commands, maps and states, for ROS 2, Foxglove, evo."""
+"""Recording of a run to MCAP logs: images as received, poses, commands, maps and states, for ROS 2, Foxglove, evo."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class SingleLog:
         self.state.messages += 1
 
     def end_file(self) -> None:
-        """Do nothing: the time of a log has no steps that begin a file."""
+        """Do nothing: in a replay the clock has no steps, which would begin a new file."""
 
     def close(self) -> None:
         """Complete the file; a second call does nothing."""
@@ -50,11 +50,11 @@ class SingleLog:
 class Recorder:
     """A sink that writes every message under `/<robot>/`.
 
-    A live run gives it an inbox that drops, so that no stage waits for the disk, and a RotatingLog, which never raises.
+    In a live run its inbox drops, so that no stage waits for the disk, and its log, a RotatingLog, never raises.
     A replay loses nothing: a message that cannot be written raises DriverError.
 
-    Without an encoder only frames are recorded. Who runs the graph closes the recorder, after what is added at the end.
-    newest_ns: latest stamp of the messages.
+    Without an encoder only frames are recorded. The caller that runs the graph closes the recorder after the last
+    message. newest_ns: latest stamp of the messages.
     """
 
     def __init__(
@@ -66,15 +66,15 @@ class Recorder:
         clock: RobotClock | None = None,
         images_hz: float = 0.0,
     ) -> None:
-        """clock: that of the stamps, None: they are Unix time; the encoder has its segment_unix_ns.
+        """clock: of the stamps, None: they are Unix time; the encoder was made with its segment_unix_ns.
 
-        images_hz: pairs a second of which the images are recorded; 0: of all. Single images are recorded in any case.
+        images_hz: pairs per second whose images are recorded; 0: all. Single images are always recorded.
         """
         self._log, self._robot, self._encode = log, robot, encode
         self._clock = clock or log_time()
         self._steps = self._clock.steps
-        self._period_ns, self._periods = round(NS_PER_S / images_hz) if images_hz else 1, -1
-        self._files = 0
+        self._period_ns, self._period_index = round(NS_PER_S / images_hz) if images_hz else 1, -1
+        self._file_count = 0
         self.newest_ns = 0
 
     @property
@@ -94,16 +94,16 @@ class Recorder:
         if self._steps != self._clock.steps:
             self._steps = self._clock.steps
             self._log.end_file()
-        # 2. Each file has all of what seldom changes.
+        # 2. Each file contains the states that seldom change.
         stamp_ns, encode = self._clock.segment_unix_ns(message.stamp_ns), self._encode
-        if encode is not None and self._files not in (0, self.state.files):
+        if encode is not None and self._file_count not in (0, self.state.files):
             encode.repeat_states()
-        self._files = self.state.files
+        self._file_count = self.state.files
         # 3. The message.
         frames: tuple[Frame, ...] = (message,) if isinstance(message, Frame) else ()
         if isinstance(message, FramePair):
-            before, self._periods = self._periods, message.stamp_ns // self._period_ns
-            frames = message.frames if self._periods != before else ()
+            previous, self._period_index = self._period_index, message.stamp_ns // self._period_ns
+            frames = message.frames if self._period_index != previous else ()
         elif encode is not None and not isinstance(message, Frame):
             self._write(encode(message), stamp_ns)
         for frame in frames:

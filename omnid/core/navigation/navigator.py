@@ -46,7 +46,7 @@ NEARER_M: Final = 1.0  # After this progress the next block is a new one.
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"
 WAITS: Final = "it goes on by itself when the way is free"
-STANDS: Final = "something stands on the path"
+OBSTRUCTED: Final = "an obstacle is on the path"
 CROSSES: Final = "somebody or something crosses the path"
 
 
@@ -330,11 +330,11 @@ class Navigator:
             first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), room_m, *look)
         # 2. Without another way, wait: on a detour that is closed at once, on the path in front of the obstacle.
         if first_m < math.inf and drive.detour is not None and drive.no_way:
-            return following, None, CROSSES if around.moves else STANDS
+            return following, None, CROSSES if around.moves else OBSTRUCTED
         left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
         braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
         if wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps:  # the base has reached the obstacle
-            return following, None, CROSSES if around.moves else STANDS
+            return following, None, CROSSES if around.moves else OBSTRUCTED
         share = min(1.0, braking_mps / wanted.velocity_mps) if wanted.velocity_mps > 0 else 1.0
         slower = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
         return following, slower, ""

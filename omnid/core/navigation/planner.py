@@ -121,13 +121,13 @@ class Planner:
             # An obstacle that from afar seems to be at the goal may be beside it: drive as near as is free, to see.
             least_m = float(away_m[is_open].min())
             if math.dist(goal, pose[:2]) < least_m + LOOK_M:
-                return f"something stands {_nearest_m(goal, around):.1f} m from the goal"
+                return f"an obstacle is {_nearest_m(goal, around):.1f} m from the goal"
             left_s[is_open & (away_m < least_m + 2 * CELL_M)] = 0.0
         elif along is None:
             left_s[is_edge & is_open] = away_m[is_edge & is_open] / velocity_mps
         wave_front(cell_s, left_s)
         if math.isinf(left_s[round(start[1]), round(start[0])]):
-            return f"what stands {_nearest_m(pose[:2], around):.1f} m away closes every way"
+            return f"an obstacle {_nearest_m(pose[:2], around):.1f} m away closes every way"
         # 2. The way, which ends at the edge of the grid if the goal is beyond.
         if not is_inside:
             inner = np.s_[MOVE_CELLS:-MOVE_CELLS, MOVE_CELLS:-MOVE_CELLS]
@@ -184,6 +184,6 @@ class Planner:
 
 
 def _nearest_m(place: Array, around: Surroundings) -> float:
-    """Return the distance of a place (2,) from what stands nearest."""
+    """Return the distance of a place (2,) from the nearest obstacle; inf without one."""
     nearest_m = float(around.room_at(place[None], around.closed_m)[0])
     return nearest_m if nearest_m < FAR_M else math.inf
