@@ -147,7 +147,7 @@ class Session:
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """What comes into a run: images, its map of places, its wheels."""
+    """The inputs of a run: images, its map of places, its wheels."""
 
     frames: Sequence[Stream[Frame | MotionSample]] | Sequence[Stream[Frame]]
     map: RunPlaces  # of places, to begin with, and its file
@@ -160,7 +160,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """The consumers of a run; a map that none of them takes is not computed, nor are places."""
+    """The consumers of a run; a map without a consumer is not computed, nor are places."""
 
     pairs: dict[str, Output[FramePair]] = field(default_factory=dict)
     poses: dict[str, Output[OdometryUpdate]] = field(default_factory=dict)
@@ -184,14 +184,14 @@ class WiredStages(NamedTuple):
 def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outputs: Outputs) -> WiredStages:
     """Join the stages to the inputs and to the outputs; return those that are asked for counts.
 
-    Where inboxes drop, one thread makes a pose of the newest images, so that what is old is dropped before any work.
+    Where inboxes drop, one thread makes a pose of the newest images, so that old images are dropped before any work.
     Else decoding and dewarping are one bounded inbox ahead of the odometry. Places, obstacles and navigation have a
-    thread each. What no wheel waits for shares one: the map, what draws or encodes it, and sinks that write.
+    thread each. Work that the wheels do not wait for shares one: the map, its drawing and encoding, and file sinks.
     """
     geometry, run_map, controller = front_end.geometry, inputs.map, inputs.controller
     T_base_rig = geometry.rig.T_base_rig
     T_base_rect = T_base_rig @ geometry.T_rig_rect
-    takes_all = outputs.bus is not None or outputs.recorder is not None
+    has_outgoing = outputs.bus is not None or outputs.recorder is not None
     places, obstacles = None, None
     commands, maps, in_map, grids, scans, ways = None, None, None, None, None, None
 
@@ -206,16 +206,16 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         commands = graph.source("drive", controller.commands, wake=controller.end)
 
     # 3. Poses give the map, the pose in it, and the obstacles, where these are consumed.
-    if outputs.maps or takes_all:
+    if outputs.maps or has_outgoing:
         mapping = Mapping(config.mapping, front_end.dense, inputs.map_every_s, keyframes_only=graph.drops)
         maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
-    if config.places.enabled and (outputs.places or takes_all or inputs.navigation or run_map.places is not None):
+    if config.places.enabled and (outputs.places or has_outgoing or inputs.navigation or run_map.places is not None):
         places = Places(geometry, config, front_end.dense, run_map.places)
         in_map = graph.stage("places", places, poses)
-    if in_map is not None and takes_all:
+    if in_map is not None and has_outgoing:
         grid = MapGrid(config.mapping.voxel_m, T_base_rect, inputs.map_every_s)
         grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
-    if config.obstacles.enabled and (outputs.scans or takes_all or inputs.navigation):
+    if config.obstacles.enabled and (outputs.scans or has_outgoing or inputs.navigation):
         obstacles = Obstacles(geometry, config.obstacles, front_end.dense)
         scans = graph.stage("obstacles", obstacles, poses)
 
@@ -231,15 +231,14 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         map_name = config.places.map if places else ""
         stage = NavigationStage(config.navigation, *of_base, map_name, files.routes, is_new=run_map.is_new)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
-        given = poses, in_map, scans, wheels, requests
-        seen: list[Stream[Any]] = [stream for stream in given if stream is not None]
-        ways = graph.stage("navigation", stage, *seen)
+        inbox: list[Stream[Any] | None] = [poses, in_map, scans, wheels, requests]
+        ways = graph.stage("navigation", stage, *(stream for stream in inbox if stream is not None))
         answers.append(graph.stage("answers", navigation_answers, ways, thread=ways.thread))
         answers.append(graph.stage("taught", files.write, ways, thread=FILES))
         if controller is not None:
             graph.sink("planner-drive", partial(send_setpoint, controller), ways, thread=ways.thread)
 
-    # 5. What is made is consumed, and leaves the run.
+    # 5. Sinks of each stream: those of the run, then the bus and the recorder.
     consumed: list[tuple[dict[str, Any], Stream[Any] | None, str]] = [
         (outputs.counters, poses, poses.thread),
         (outputs.pairs, pairs, BACKGROUND),

@@ -39,10 +39,10 @@ from omnid.stages.synchronise import Decoder
 
 Array = NDArray[np.float64]
 
-FRAMES = 12  # of both cameras, in the maximum of which the rims are looked for
+RIM_FRAMES = 12  # frames of both cameras whose maximum is searched for the rims
 
 NOISE_NS = NS_PER_S  # Time between two measurements of the noise, because exposure changes it slowly.
-BLUR_SHARE = 0.6  # sigma of the blur by the additional pixels that a pixel of the panorama covers
+BLUR_SHARE = 0.6  # sigma of the blur as a fraction of sqrt(n^2 - 1), see _blur_px
 DISPARITY_STEP_PX = 32  # the semi-global prior searches a multiple of it
 
 
@@ -76,7 +76,7 @@ def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
     mounted: dict[Camera, MountedCamera] = {"lower": rig.lower, "upper": rig.upper}
     missing = [name for name, camera in mounted.items() if camera.mask is None]
     decode, brightest = Decoder(rig), dict[Camera, NDArray[np.uint8]]()
-    for frame in islice(frames, FRAMES if missing else 0):
+    for frame in islice(frames, RIM_FRAMES if missing else 0):
         image = decode(frame)
         if image is not None:
             brightest[frame.camera] = np.maximum(brightest.get(frame.camera, image), image)
@@ -92,7 +92,7 @@ class Dewarp:
     def __init__(self, geometry: Geometry, config: PanoramaConfig) -> None:
         self._noise_grey: dict[Side, float] = {}  # noise of each camera before its gain
         self._measured_ns: int | None = None  # stamp of the pair in which the noise was measured last
-        self._pad_px, self._inner = config.pad_px, np.s_[:, config.pad_px : -config.pad_px]
+        self._pad_px, self._unpadded = config.pad_px, np.s_[:, config.pad_px : -config.pad_px]
         rig, self._cylinder = geometry.rig, geometry.cylinder
         self._lower, self._upper = tables = [
             remap_tables(rig, one, self._cylinder, config.pad_px) for one in (rig.lower, rig.upper)
@@ -100,12 +100,12 @@ class Dewarp:
         self._blur_px = _blur_px(tables)
         both = visible(rig.lower, self._lower, config.rim_margin_px)
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
-        self._visible = np.ascontiguousarray(_inner(both, config.margin_px)[self._inner])
+        self._visible = np.ascontiguousarray(_without_margin(both, config.margin_px)[self._unpadded])
         if not self._visible.any():
             raise OmnidError("the cameras share no part of the panorama: check the rig's transforms and masks")
         self._tiles = TileMonitor(self._visible, tile_columns(self._cylinder))
         self._upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
-        (lower_u, lower_v), (upper_u, upper_v) = ([table[self._inner] for table in maps] for maps in tables)
+        (lower_u, lower_v), (upper_u, upper_v) = ([table[self._unpadded] for table in maps] for maps in tables)
         self.raw_images = (
             RawImage(lower_u, lower_v, rig.lower.camera.size),
             RawImage(upper_u, upper_v, rig.upper.camera.size),
@@ -123,11 +123,11 @@ class Dewarp:
         for side, (image, maps, _) in raw.items():
             smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
             padded[side] = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
-            grey[side] = np.ascontiguousarray(padded[side][self._inner])
+            grey[side] = np.ascontiguousarray(padded[side][self._unpadded])
         if self._measured_ns is None or abs(pair.stamp_ns - self._measured_ns) >= NOISE_NS:
             self._measured_ns = pair.stamp_ns
             self._noise_grey = {side: noise_sigma(grey[side], self._visible) for side in SIDES}
-        # 2. The light of each, and of the camera that shows less contrast, which decides how much there is.
+        # 2. The light of each image; the dimmer one, with less contrast, counts for the pair.
         sums = {side: self._tiles.sums(side, grey[side]) for side in SIDES}
         lights = [light(sums[side], self._noise_grey[side]) for side in SIDES]
         dimmer = min(lights, key=lambda light: light.contrast_to_noise)
@@ -148,7 +148,7 @@ class Dewarp:
             )
             for side in SIDES
         )
-        # 4. Times of exposure of the pixels, and parts of the images that are dead or blind.
+        # 4. Exposure times of the pixels, and tiles of the images that are dead or blind.
         times = PixelTimes(pair.skew_s + self._upper_delay_s, *self._rows_s)
         tiles = self._tiles.update(grey, sums, self._noise_grey)
         return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
@@ -157,14 +157,14 @@ class Dewarp:
 def _blur_px(tables: Sequence[Maps]) -> float:
     """Return the sigma [px] of the blur of the images, so that a coarser panorama has no aliasing; 0: none.
 
-    A pixel of a panorama that covers n pixels of the image has the blur that makes one of n.
+    A pixel of the panorama covers n pixels of the image; the blur averages over them.
     """
     steps = [np.hypot(np.diff(u, axis=1), np.diff(v, axis=1))[(u[:, 1:] >= 0) & (u[:, :-1] >= 0)] for u, v in tables]
     covered_px = float(np.median(np.concatenate(steps)))
     return BLUR_SHARE * math.sqrt(covered_px**2 - 1) if covered_px > 1 else 0.0
 
 
-def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
+def _without_margin(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
     """Return the region (H, W) without a margin along its border and along the first and last rows."""
     side = 2 * margin_px + 1
     inner = cv2.erode(region.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=1) > 0
@@ -194,17 +194,17 @@ class DenseDepths:
         nearest_px = self._cylinder.focal_px * self._baseline_m / config.min_range_m
         disparities = min(config.matching.disparities, math.ceil(nearest_px / step_px) * step_px, limit)
         self._matching = replace(config.matching, disparities=disparities)
-        self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
-        self._known: WeakKeyDictionary[Panoramas, tuple[dict[object, DensePoints], Lock]] = WeakKeyDictionary()
-        self._one = Lock()
+        self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matches
+        self._cache: WeakKeyDictionary[Panoramas, tuple[dict[object, DensePoints], Lock]] = WeakKeyDictionary()
+        self._cache_lock = Lock()
 
     def of(self, depth: StereoDepth) -> DensePoints:
         """Return the dense depth of a pair whose pose is known: points that its earlier view does not contradict."""
         dense, earlier = self.points(depth.panoramas, depth.exposure), depth.earlier
         if earlier is None:
             return dense
-        compute = partial(self._confirmed, depth.panoramas.lower, dense, earlier)
-        return self._once(depth.panoramas, (depth.exposure, earlier), compute)
+        compute = partial(self._confirm, depth.panoramas.lower, dense, earlier)
+        return self._cached(depth.panoramas, (depth.exposure, earlier), compute)
 
     def points(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
         """Return disparities and their points in the rig frame, as matched, at the stamp of the pair.
@@ -212,18 +212,18 @@ class DenseDepths:
         exposure: the motion during the exposures; None: unknown.
         """
         exposure = None if exposure is None or exposure.times.is_at_once else exposure
-        return self._once(panoramas, exposure, partial(self._computed, panoramas, exposure))
+        return self._cached(panoramas, exposure, partial(self._compute, panoramas, exposure))
 
-    def _once(self, panoramas: Panoramas, key: object, compute: Callable[[], DensePoints]) -> DensePoints:
-        """Return what was computed of a pair, by what it depends on; others wait meanwhile."""
-        with self._one:
-            known, one = self._known.setdefault(panoramas, ({}, Lock()))
-        with one:
-            if key not in known:
-                known[key] = compute()
-            return known[key]
+    def _cached(self, panoramas: Panoramas, key: object, compute: Callable[[], DensePoints]) -> DensePoints:
+        """Return the depth of a pair, computed once per key, the inputs it depends on; other threads wait meanwhile."""
+        with self._cache_lock:
+            cached, lock = self._cache.setdefault(panoramas, ({}, Lock()))
+        with lock:
+            if key not in cached:
+                cached[key] = compute()
+            return cached[key]
 
-    def _computed(self, panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
+    def _compute(self, panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
         """Return the depth of panoramas, corrected for a motion during their exposures."""
         # 1. Match the pixels of the lower panorama along their columns.
         lower, pad = panoramas.lower, panoramas.lower.pad_px
@@ -238,11 +238,11 @@ class DenseDepths:
         rows, columns = np.divmod(flat, lower.image.shape[1])
         columns -= pad
         # 2. Correct rows and disparities to the stamp of the pair.
-        views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
+        views, motion_variance = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
         if exposure is not None:
-            views, of_motion = exposure.corrected(views[:, :2], views[:, 2])
-            noise = of_motion.noise(exposure.motion)
-            by_motion = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
+            views, motion_model = exposure.corrected(views[:, :2], views[:, 2])
+            noise = motion_model.noise(exposure.motion)
+            motion_variance = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = views[:, 2] - views[:, 1]
         # 3. Triangulate, with the variance along the ray: the distance from the axis is r = f t / d, so sigma_r is
@@ -252,11 +252,11 @@ class DenseDepths:
         points = points[kept]
         r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
         per_px = r2 / (self._cylinder.focal_px * self._baseline_m)
-        variance_m2 = (1 + z2 / r2) * per_px**2 * (self._config.noise_px**2 + by_motion[kept])
+        variance_m2 = (1 + z2 / r2) * per_px**2 * (self._config.noise_px**2 + motion_variance[kept])
         pixels = np.column_stack([columns, rows])[kept].astype(float)
         return DensePoints(disparity, pixels, se3.apply(self._T_rig_rect, points), variance_m2)
 
-    def _confirmed(self, lower: PaddedPanorama, dense: DensePoints, earlier: EarlierView) -> DensePoints:
+    def _confirm(self, lower: PaddedPanorama, dense: DensePoints, earlier: EarlierView) -> DensePoints:
         """Return the dense points of a pair without those that its earlier view contradicts."""
         points = se3.apply(se3.inverse(self._T_rig_rect), dense.points)
         wrong = contradicted(lower, dense.pixels, points, self._cylinder, earlier)

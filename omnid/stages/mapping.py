@@ -141,11 +141,11 @@ class Places:
         self._T_rig_rect = geometry.T_rig_rect
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._limits = config.obstacles.scan
-        self._obstacles = Obstacles(geometry, config.obstacles, dense)  # at keyframes
+        self._obstacles = Obstacles(geometry, config.obstacles, dense)  # seen at keyframes
         self.floor = self._obstacles.floor
         self.state = MapState.ODOMETRY_ONLY  # state of the newest pose
         self.counts = self._localiser.counts  # sizes and counters of the map
-        self._shown: object = None  # scans of the map when these were counted and its keyframes were copied
+        self._copied_scans: object = None  # scans of the map at the last copy of counts and keyframes
         self._keyframes: MapKeyframes | None = None
 
     def map(self) -> PlaceMap:
@@ -158,21 +158,21 @@ class Places:
         # 1. The pose in the map.
         pose = self._localiser.process(self._frame(odometry))
         self.state = pose.state
-        # 2. What other threads need of the map, which they never read itself.
+        # 2. Copies for other threads, which never read the map itself.
         scans = self._localiser.scans()
-        if self._keyframes is None or scans is not self._shown:
+        if self._keyframes is None or scans is not self._copied_scans:
             ids = sorted(places.keyframes)
             stamps_ns = {id: places.keyframes[id].stamp_ns for id in ids}
             self._keyframes = MapKeyframes(stamps_ns, {id: places.poses[id] for id in ids})
-            self._shown, self.counts = scans, self._localiser.counts
+            self._copied_scans, self.counts = scans, self._localiser.counts
         # 3. The message, in the frame of the rig.
-        T_map_odom, to_rig = self._in_rig(pose.T_map_odom), se3.adjoint(self._T_rig_rect)
+        T_map_odom, adjoint = self._in_rig(pose.T_map_odom), se3.adjoint(self._T_rig_rect)
         return PlaceUpdate(
             odometry.seq,
             odometry.stamp_ns,
             T_map_odom,
             T_map_odom @ odometry.T_odom_rig,
-            to_rig @ pose.covariance @ to_rig.T,
+            adjoint @ pose.covariance @ adjoint.T,
             pose.state,
             pose.keyframe,
             self._in_rig(pose.T_keyframe_rect),
@@ -186,12 +186,12 @@ class Places:
         return {"state": self.state, **self.counts}
 
     def corrected(self, update: PlaceUpdate) -> Array:
-        """Return T_map_rig (4, 4) of an earlier pose by the map of now; unchanged if its keyframe was dropped."""
+        """Return T_map_rig (4, 4) of an earlier pose by the present map; unchanged if its keyframe was dropped."""
         T_map_rect = self._localiser.places.poses.get(update.keyframe)
         return update.T_map_rig if T_map_rect is None else self._in_rig(T_map_rect) @ update.T_keyframe_rig
 
     def known(self, updates: Sequence[PlaceUpdate]) -> NDArray[np.bool_]:
-        """Return at which of earlier poses (N,) it is known now where odom lay in the map that can be saved."""
+        """Return flags (N,) of the earlier poses whose place in the map that can be saved is known now."""
         all_ids, joined = self._localiser.places.keyframes, self.map().keyframes
         return np.array(
             [update.keyframe in joined or (update.keyframe not in all_ids and update.is_known) for update in updates],
@@ -237,7 +237,7 @@ def keyframe_ranges(
 ) -> tuple[RangeScan, FreeRanges]:
     """Return the ranges of a keyframe and up to where its floor is free, (SECTORS,) by azimuth in the rectified frame.
 
-    They are turned level, and those of the floor below the lower viewpoint. scan: of obstacles at the keyframe.
+    The frame is turned level, with its origin on the floor below the lower viewpoint. scan: obstacles at the keyframe.
     """
     floor = camera_floor.floor
     if floor is None:

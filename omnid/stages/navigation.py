@@ -13,7 +13,7 @@ from calib.se2_arrays import planar
 from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.core.navigation.follower import STAND
+from omnid.core.navigation.follower import STANDSTILL
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import (
@@ -165,7 +165,7 @@ class NavigationStage:
             refusal = str(error)
         if self._taught is taught:
             self._answer = RequestAnswer(command.id, word, refusal)
-        setpoint = STAND if navigator.stopping else None
+        setpoint = STANDSTILL if navigator.stopping else None
         update = self._update(Navigation(setpoint, navigator.state, navigator.reason), always=True)
         assert update is not None
         return update

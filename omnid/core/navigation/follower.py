@@ -24,11 +24,11 @@ TURN_RAD, TURNED_RAD = math.radians(45), math.radians(4)
 BRAKE_SHARE: Final = 0.7  # Share of the deceleration that is planned, because the base follows with a lag.
 APPROACH_HZ: Final = 1.2  # speed per distance to the end, so that the last centimetres are slow
 LAST_MPS: Final = 0.02  # Least speed before the end: twice the noise of odometry at standstill.
-SETTLED: Final = 3  # poses one after the other that must be within the tolerance, standing
+SETTLED: Final = 3  # consecutive poses at rest that must be within the tolerance
 SETTLED_RADPS: Final = 0.1
 CORNER_M: Final = 0.03  # A leg ends this far from its end, unless it is the last one.
 CORRECTIONS: Final = 3  # Most short drives that correct the distance left to the goal.
-STAND: Final = Setpoint(0.0, None, 0.0)  # exact zeros: no motion
+STANDSTILL: Final = Setpoint(0.0, None, 0.0)  # exact zeros: no motion
 
 
 class Following(NamedTuple):
@@ -108,7 +108,7 @@ class Follower:
                 return following._replace(left_m=following.left_m + left_m)
             if rest:
                 self._begin(self._number + 1)
-                return Following(STAND, left_m, following.offset_m)
+                return Following(STANDSTILL, left_m, following.offset_m)
             self.aligns = True
         # 2. At the end, turn to the heading of the goal on the spot.
         goal_rad, missing = self.path.final_heading_rad, self.path.goal - pose[:2]
@@ -118,18 +118,18 @@ class Follower:
         within = abs(error_rad) <= math.radians(self.settings.goal_deg)
         self._settled = self._settled + 1 if is_at_rest and within else 0
         if self._settled < SETTLED:
-            return Following(STAND if goal_rad is None else Setpoint(0.0, goal_rad), missing_m)
+            return Following(STANDSTILL if goal_rad is None else Setpoint(0.0, goal_rad), missing_m)
         # 3. Drive what is missing then, or end.
         if missing_m <= goal_m or self._corrections >= CORRECTIONS:
-            return Following(STAND, 0.0, 0.0, True, missing_m)
+            return Following(STANDSTILL, 0.0, 0.0, True, missing_m)
         self._corrections, self._settled, self.aligns = self._corrections + 1, 0, False
         aside_rad = abs(wrap_angle(math.atan2(missing[1], missing[0]) - float(pose[2])))
         self._legs.append(straight_leg(pose, self.path.goal, backwards=aside_rad > math.pi / 2))
         self._begin(self._number + 1)
-        return Following(STAND, missing_m)
+        return Following(STANDSTILL, missing_m)
 
     def _pursue(self, stamp_ns: int, pose: Array, speed_mps: float, obstacle_m: float) -> Following:
-        """Return the motion along the present leg, and what is left of it."""
+        """Return the motion along the present leg, and the way that is left of it."""
         s, leg = self.settings.pursuit, self._leg
         dt_s = 0.0 if self._last_ns is None else min(max((stamp_ns - self._last_ns) * 1e-9, 0.0), 0.5)
         self._last_ns = stamp_ns

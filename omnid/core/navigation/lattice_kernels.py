@@ -48,15 +48,15 @@ def wave_front(cell_s: Doubles, left_s: Doubles) -> None:
 
 
 @inner
-def room_at(
-    room_m: Doubles, movers: Doubles, cell_m: float, meeting_s: float, x: float, y: float, at_s: float
+def distance_at(
+    distance_m: Doubles, movers: Doubles, cell_m: float, meeting_s: float, x: float, y: float, at_s: float
 ) -> float:
-    """Return the distance [m] of a place [cells] from what stands, and from what moves about a time [s].
+    """Return the distance [m] of a place [cells] to the nearest obstacle, at rest or moving, about a time [s].
 
     movers (K, 5): place, velocity and radius, in cells and seconds.
     """
-    size = len(room_m)
-    away_m: float = room_m[min(max(round(y), 0), size - 1), min(max(round(x), 0), size - 1)]
+    size = len(distance_m)
+    away_m: float = distance_m[min(max(round(y), 0), size - 1), min(max(round(x), 0), size - 1)]
     for k in range(len(movers)):
         to_x, to_y = x - movers[k, 0], y - movers[k, 1]
         vx, vy = movers[k, 2], movers[k, 3]
@@ -68,7 +68,7 @@ def room_at(
 
 @compiled("(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", writes=())
 def search(
-    room_m: Doubles,
+    distance_m: Doubles,
     cell_s: Doubles,
     left_s: Doubles,
     start: Doubles,
@@ -79,14 +79,15 @@ def search(
 ) -> Doubles:
     """Return the fastest way (K, 4) of x, y, heading and move from a pose to where no time is left, empty without one.
 
-    room_m: distance to what stands nearest. cell_s: time across a cell. left_s: lower bound of the time left.
-    start (3,): x, y in cells, heading. moves (M, 4): signed way in cells, turn [rad], least time [s], kind (0: ahead,
-    1: back, 2: turn). discs (3, D): centres ahead of the origin [cells] of the discs that cover what must be free in
-    a move of each kind. movers: as in `room_at`. limits: radius of the discs [m], time of a change of the kind [s],
-    time left that counts as none [s], heading at the end [rad], NaN for any, kind of the move that cannot be the first
-    one, -1 for none, size of a cell [m], by which what moves may be early or late [s], up to which it is predicted [s].
+    distance_m: to the nearest obstacle at rest. cell_s: time across a cell. left_s: lower bound of the time left. start
+    (3,): x, y in cells, heading. moves (M, 4): signed way in cells, turn [rad], least time [s], kind (0: ahead, 1:
+    back, 2: turn). discs (3, D): centres ahead of the origin [cells] of the discs that cover what must be free in a
+    move of each kind. movers: as in `distance_at`. limits: radius of the discs [m], time of a change of the kind [s],
+    time left at which the goal is reached [s], heading at the end [rad] (NaN: any), kind of the move that cannot be the
+    first one (-1: none), size of a cell [m], time by which moving objects may be early or late [s], time up to which
+    they are predicted [s].
     """
-    size = len(room_m)
+    size = len(distance_m)
     radius_m, change_s, done_s, end_rad, barred, cell_m, meeting_s, horizon_s = limits
     nodes = np.empty((MOST_NODES, 4))  # x, y, heading, time
     from_node = np.empty(MOST_NODES, np.int64)
@@ -131,11 +132,11 @@ def search(
             there_bin = round(to_heading * HEADINGS / math.tau) % HEADINGS
             if there_s >= best_s[r, c, there_bin] - 1e-9 or count == MOST_NODES:
                 continue
-            # 3. The room of the base there; where it begins too near to something, it may get no nearer.
+            # 3. The distance of obstacles there; a base that begins too near to one may get no nearer.
             is_free = True
             for disc in discs[int(kind)]:
-                there = room_at(
-                    room_m,
+                there = distance_at(
+                    distance_m,
                     movers,
                     cell_m,
                     meeting_s,
@@ -145,7 +146,7 @@ def search(
                 )
                 if there < radius_m:
                     here_x, here_y = x + disc * math.cos(heading), y + disc * math.sin(heading)
-                    here = room_at(room_m, movers, cell_m, meeting_s, here_x, here_y, min(at_s, horizon_s))
+                    here = distance_at(distance_m, movers, cell_m, meeting_s, here_x, here_y, min(at_s, horizon_s))
                     is_free = is_free and here < radius_m and there >= here
             if is_free:
                 best_s[r, c, there_bin] = there_s

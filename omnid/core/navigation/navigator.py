@@ -19,7 +19,7 @@ from omnid.core.control.arming import PLANNER
 from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
-from omnid.core.navigation.follower import BRAKE_SHARE, STAND, Follower, Following
+from omnid.core.navigation.follower import BRAKE_SHARE, STANDSTILL, Follower, Following
 from omnid.core.navigation.path import SHORTEST_M, DrivePath, goal_path
 from omnid.core.navigation.planner import Move, Planner
 from omnid.core.navigation.requests import NavigationFrame
@@ -76,18 +76,18 @@ class Drive:
     paused: str = ""  # reason of the pause; empty: it is not paused
     waited_s: float = 0.0  # for the pose in the map
     unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
-    localised_ns: int = -1  # stamp of that pose
+    localised_ns: int = -1  # stamp of the last known pose in the map
     nearest_m: float = math.inf  # length of the way that was left at the last progress
     stuck_s: float = 0.0  # time since the last progress
     least_m: float = math.inf  # least length of the way that was left, in steps of NEARER_M
-    lost_s: float = 0.0  # time since then for which no way was free
-    tried_s: float = 0.0  # time since then on ways that were blocked again
+    lost_s: float = 0.0  # time for which no way was free, since least_m fell
+    tried_s: float = 0.0  # time on ways that were blocked again, since least_m fell
     way_s: float = 0.0  # time on the present way
-    ways: int = 0  # number of ways that were tried since then
+    ways: int = 0  # number of ways that were tried since least_m fell
     searched_ns: int = -AGAIN_NS  # stamp of the last search
-    no_way: str = ""  # why that search found none
+    no_way: str = ""  # why the last search found no way
     move: Move | None = None  # kind of the newest motion that was wanted
-    is_waiting: bool = False  # a way around is known that takes longer than what it has waited is worth
+    is_waiting: bool = False  # it waits, because the known way around takes longer than the time already waited
 
     @property
     def on_way(self) -> Follower:
@@ -105,9 +105,9 @@ class Drive:
         xy = self.on_way.ahead(way_m).xy
         return xy if self.detour is not None else self.in_odom(xy, now)
 
-    def step(self, now: Situation, room_m: float) -> Following:
-        """Return the motion along the path or the detour, in odom; at its end the path goes on."""
-        motion = now.speed_mps, now.yaw_rate_radps, room_m
+    def step(self, now: Situation, clearance_m: float) -> Following:
+        """Return the motion along the detour, and after its end along the path; in odom."""
+        motion = now.speed_mps, now.yaw_rate_radps, clearance_m
         if self.detour is not None:
             following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
             if not following.done and following.left_m >= SHORTEST_M:
@@ -176,7 +176,7 @@ def held(drive: Drive, now: Situation, settings: NavigationSettings) -> tuple[Na
     if drive.frame is NavigationFrame.MAP and drive.unlocalised_m > settings.unlocalised_m:
         why = refusal_of_map(now, settings.map_sigma_m).partition(":")[0]
         return NavigationState.NOT_LOCALISED, why or "not localised"
-    # 3. Who else drives.
+    # 3. Other sources of commands.
     if wheels.source not in ("", PLANNER):
         return NavigationState.PAUSED, f"{wheels.source} drives: it goes on when that ends"
     return None
@@ -243,33 +243,33 @@ class Navigator:
         dt_s = 0.0 if self._last_ns is None else min(max((now.stamp_ns - self._last_ns) * 1e-9, 0.0), LONGEST_STEP_S)
         self._last_ns, drive, settings = now.stamp_ns, self.drive, self.settings
         if drive is None:
-            self._stops, stop = max(self._stops - 1, 0), STAND if self._stops else None
+            self._stops, stop = max(self._stops - 1, 0), STANDSTILL if self._stops else None
             return Navigation(stop, self.state, self.reason)
-        # 1. Wheels, pose, and who else drives.
+        # 1. Faults of wheels or pose, and other sources of commands.
         self._follow_map(drive, now)
         hold = held(drive, now, settings)
         if hold is not None:
             return self._wait(drive, *hold, dt_s)
         drive.resets = now.resets
         # 2. The way.
-        following = drive.step(now, self._room_m(drive, now))
+        following = drive.step(now, self._clearance_m(drive, now))
         move = _kind(following.setpoint)
         drive.move = drive.move if move is None else move
         if following.done:
             return self._finished(drive, following.missed_m)
-        if abs(following.offset_m) > settings.corridor_m + self._planner.room_m:
+        if abs(following.offset_m) > settings.corridor_m + self._planner.required_m:
             return self._end(
                 NavigationState.FAILED,
                 f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again",
             )
         if following.left_m < drive.least_m - NEARER_M:
             drive.least_m, drive.ways, drive.lost_s, drive.tried_s = following.left_m, 0, 0.0, 0.0
-        # 3. Obstacles on it, and a safety rule that holds the wheels because of one.
+        # 3. Obstacles on the way, and a safety rule that holds the wheels because of an obstacle.
         following, setpoint, reason = self._around_obstacles(drive, now, following)
         held_by = now.wheels.held_by
-        if setpoint is None or held_by:  # where it is held, the setpoint is still sent: the monitor lets go by itself
+        if setpoint is None or held_by:  # Held wheels still get it: the monitor releases them.
             return self._blocked(drive, reason if setpoint is None else held_by, following, dt_s, setpoint)
-        # 4. Progress: where it is missing for too long, the drive fails.
+        # 4. The drive fails after too long a time without progress.
         avoids = drive.detour is not None
         drive.advance(now, following.left_m, dt_s)
         if drive.stuck_s > settings.stuck_s:
@@ -281,7 +281,7 @@ class Navigator:
         return Navigation(setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _follow_map(self, drive: Drive, now: Situation) -> None:
-        """Add the way since the last pose to that without a pose in the map; leave a way of an odom that is lost."""
+        """Add to the distance driven without a pose in the map; drop a detour after a reset of odometry."""
         drive.unlocalised_m += float(np.hypot(*(now.pose[:2] - drive.xy)))
         drive.xy = now.pose[:2].copy()
         if drive.resets != now.resets:
@@ -303,14 +303,14 @@ class Navigator:
             if drive.waited_s > self.settings.unlocalised_s:
                 return self._end(NavigationState.FAILED, f"{state} for {self.settings.unlocalised_s:g} s: {reason}")
         self.state, self.reason = state, reason
-        return Navigation(None if state is NavigationState.PAUSED else STAND, state, reason)
+        return Navigation(None if state is NavigationState.PAUSED else STANDSTILL, state, reason)
 
-    def _room_m(self, drive: Drive, now: Situation) -> float:
+    def _clearance_m(self, drive: Drive, now: Situation) -> float:
         """Return the distance [m] from the side of the base to the nearest obstacle on the next front_m."""
         if now.around is None:
             return math.inf
         near = drive.ahead(now, self.collision.front_m)
-        return float(now.around.room_at(near).min()) - self.collision.half_width_m
+        return float(now.around.distance_at(near).min()) - self.collision.half_width_m
 
     def _around_obstacles(
         self, drive: Drive, now: Situation, following: Following
@@ -319,30 +319,30 @@ class Navigator:
         around, wanted = now.around, following.setpoint
         if around is None or drive.on_way.aligns:
             return following, wanted, ""
-        # 1. Where the way is blocked another one is searched, and where that to a goal may be shorter by now.
-        pursuit, room_m = self.settings.pursuit, self._planner.room_m
+        # 1. Search another way if this one is blocked, or if a shorter one to the goal may be free by now.
+        pursuit, required_m = self.settings.pursuit, self._planner.required_m
         look = now.stamp_ns, pursuit.velocity_mps
-        kept_m = room_m + (self.settings.clearance_m if drive.detour is None else 0.0)
+        kept_m = required_m + (self.settings.clearance_m if drive.detour is None else 0.0)
         first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), kept_m, *look)
-        if self._takes_other_way(drive, now, around, following, is_closed=first_m < math.inf):
-            following = drive.step(now, self._room_m(drive, now))
+        if self._begin_other_way(drive, now, around, following, is_closed=first_m < math.inf):
+            following = drive.step(now, self._clearance_m(drive, now))
             wanted = following.setpoint
-            first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), room_m, *look)
-        # 2. Without another way, wait: on a detour that is closed at once, on the path in front of the obstacle.
+            first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), required_m, *look)
+        # 2. Without another way, wait: on a blocked detour at once, on the path in front of the obstacle.
         if first_m < math.inf and drive.detour is not None and drive.no_way:
-            return following, None, CROSSES if around.moves else OBSTRUCTED
+            return following, None, CROSSES if around.has_moving else OBSTRUCTED
         left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
         braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
         if wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps:  # the base has reached the obstacle
-            return following, None, CROSSES if around.moves else OBSTRUCTED
+            return following, None, CROSSES if around.has_moving else OBSTRUCTED
         share = min(1.0, braking_mps / wanted.velocity_mps) if wanted.velocity_mps > 0 else 1.0
         slower = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
         return following, slower, ""
 
-    def _takes_other_way(
+    def _begin_other_way(
         self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_closed: bool
     ) -> bool:
-        """True if the base begins another way; is_closed: an obstacle is or will be on the present one.
+        """Begin another way if it is better, and return True. is_closed: an obstacle is or will be on the present one.
 
         A long way around an obstacle is chosen only after a wait as long as it takes longer: it is unknown when the
         present way is free again, and so at most twice the least time is lost (the ski rental problem).
@@ -370,7 +370,7 @@ class Navigator:
             return False
         drive.no_way = ""
         if is_blocked:
-            may_leave = is_closed and (detour is None or around.moves)
+            may_leave = is_closed and (detour is None or around.has_moving)
             worth_m = following.left_m + LOOK_M + settings.pursuit.velocity_mps * drive.lost_s
             drive.is_waiting = may_leave and found.length_m > worth_m
             if drive.is_waiting:
@@ -391,9 +391,9 @@ class Navigator:
         else:
             ahead = drive.follower.ahead(2 * LOOK_M)
             corridor = drive.in_odom(ahead.xy, now)
-            of = around.room_m if barred is None else around.closed_m  # by floor that is not seen
-            near_m = around.near_m(corridor, now.stamp_ns, settings.pursuit.velocity_mps, of)
-            k = _behind(corridor, near_m < self._planner.room_m + settings.clearance_m)
+            distances = around.distance_m if barred is None else around.closed_distance_m
+            distance_m = around.path_distance_m(corridor, now.stamp_ns, settings.pursuit.velocity_mps, distances)
+            k = _behind(corridor, distance_m < self._planner.required_m + settings.clearance_m)
             if k is None:
                 return "the path is not free within sight"
             goal, place = corridor[k], (int(ahead.legs[k]), float(ahead.s[k]))
@@ -418,14 +418,14 @@ class Navigator:
             why = reason if setpoint is not None else drive.no_way or reason
             return self._end(NavigationState.FAILED, f"no way to the goal, {following.left_m:.1f} m are left: {why}")
         self.state, self.reason = NavigationState.BLOCKED, f"{reason}: {WAITS}"
-        return Navigation(setpoint or STAND, self.state, self.reason, following.left_m, following.offset_m)
+        return Navigation(setpoint or STANDSTILL, self.state, self.reason, following.left_m, following.offset_m)
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:
         """Begin the next path, or end."""
         if len(drive.paths) > 1:
             del drive.paths[0]
             drive.follower, drive.nearest_m = Follower(drive.paths[0], self.settings), math.inf
-            return Navigation(STAND, self.state, self.reason, drive.paths[0].length_m, 0.0)
+            return Navigation(STANDSTILL, self.state, self.reason, drive.paths[0].length_m, 0.0)
         if missed_m > self.settings.goal_cm * 0.01:
             return self._end(NavigationState.FAILED, f"the goal is missed by {100 * missed_m:.1f} cm")
         return self._end(NavigationState.REACHED, "")._replace(left_m=0.0)
@@ -434,7 +434,7 @@ class Navigator:
         """End the drive, with the first of some stops."""
         self.drive, self._stops = None, STOPS
         self.state, self.reason = state, reason
-        return Navigation(STAND, state, reason)
+        return Navigation(STANDSTILL, state, reason)
 
 
 def _behind(path: Array, is_blocked: NDArray[np.bool_]) -> int | None:
@@ -451,7 +451,7 @@ def _behind(path: Array, is_blocked: NDArray[np.bool_]) -> int | None:
 
 def _kind(setpoint: Setpoint) -> Move | None:
     """Return the kind of a motion, None for none."""
-    if setpoint == STAND:
+    if setpoint == STANDSTILL:
         return None
     if setpoint.velocity_mps == 0.0:
         return Move.TURN

@@ -30,7 +30,7 @@ BACK_MPS: Final = 0.2  # slower than forwards, because people do not expect a ro
 MARGIN_M: Final = 0.2 * CELL_M  # room for errors of the grid and of the base on its way
 # Speed that is planned through floor that was not seen: a detour over floor that was is preferred up to 4 times as far.
 UNKNOWN_MPS: Final = 0.1
-LOOK_M: Final = 1.0  # Distance from which an obstacle at the goal is seen well.
+LOOK_M: Final = 1.0  # An obstacle at the goal is seen well from this distance.
 
 
 class Move(IntEnum):
@@ -55,14 +55,14 @@ class Planner:
         """collision: the outline of the base, and the room that the collision monitor demands."""
         self._settings, pursuit = settings, settings.pursuit
         self._half_width_m = collision.half_width_m
-        self.room_m = collision.half_width_m + collision.side_m  # least, beside the middle of the base
+        self.required_m = collision.half_width_m + collision.side_m  # distance of obstacles from the middle of the base
         # 1. What must be free ahead of the origin and behind it in a move of each kind, covered by discs of one radius.
         front_m, rear_m, stop_m = collision.front_m, collision.rear_m, collision.stop_m
         spans = ((-rear_m, front_m + stop_m), (-rear_m - stop_m, front_m), (-rear_m, front_m))
         longest_m = max(end - begin for begin, end in spans)
-        count = math.ceil(2 * longest_m / self.room_m)
+        count = math.ceil(2 * longest_m / self.required_m)
         reach_m = longest_m / (2 * count)
-        self._radius_m = math.hypot(self.room_m + MARGIN_M, reach_m)
+        self._radius_m = math.hypot(self.required_m + MARGIN_M, reach_m)
         self._discs = np.array([np.linspace(begin + reach_m, end - reach_m, count) for begin, end in spans]) / CELL_M
         # 2. The moves: signed way in cells, turn, least time, kind.
         turn_rad = math.tau / HEADINGS
@@ -76,13 +76,13 @@ class Planner:
 
     def is_straight_free(self, pose: Array, goal: Array, around: Surroundings, now_ns: int) -> bool:
         """True if a goal (2,) is ahead and nothing is on the straight way to it, with a cell to spare."""
-        leg, room_m = straight_leg(pose, goal), self.room_m + self._settings.clearance_m + CELL_M
+        leg, least_m = straight_leg(pose, goal), self.required_m + self._settings.clearance_m + CELL_M
         if math.cos(float(leg.heading[0] - pose[2])) < math.cos(math.pi / 4):
             return False
         speed_mps = self._settings.pursuit.velocity_mps
         return bool(
-            math.isinf(around.first_blocked_m(leg.xy, room_m, now_ns, speed_mps))
-            and around.room_at(leg.xy, distances_m(around.is_unknown)).min() >= room_m
+            math.isinf(around.first_blocked_m(leg.xy, least_m, now_ns, speed_mps))
+            and around.distance_at(leg.xy, distances_m(around.is_unknown)).min() >= least_m
         )
 
     def way(
@@ -139,8 +139,9 @@ class Planner:
         change_s = velocity_mps / self._settings.pursuit.acceleration_mps2
         done_s, first = MOVE_CELLS * CELL_M / velocity_mps, -1 if barred is None else barred
         limits = self._radius_m, change_s, done_s, heading_rad, first, CELL_M, MEETING_S, HORIZON_S
-        of_base = np.append(start, pose[2]), self._moves, self._discs
-        found = search(around.closed_m, cell_s, left_s, *of_base, movers, np.array(limits, np.float64))
+        begin, limits_array = np.append(start, pose[2]), np.array(limits, np.float64)
+        grids = around.closed_distance_m, cell_s, left_s
+        found = search(*grids, begin, self._moves, self._discs, movers, limits_array)
         if len(found) == 0:
             return "the base does not fit through"
         # 3. Its points and its time; turns on the spot are the corners of a path.
@@ -162,21 +163,21 @@ class Planner:
     def _times(self, start: Array, around: Surroundings, along: Array | None) -> Array:
         """Return the time across each cell [s], inf where the base cannot be, or may not; start (2,): its cell."""
         # 1. By the speed that is driven at this distance from obstacles, and through floor that was not seen.
-        pursuit, room_m = self._settings.pursuit, around.closed_m
-        gap = (room_m - self._half_width_m) / pursuit.slow_obstacle_m
+        pursuit, distance_m = self._settings.pursuit, around.closed_distance_m
+        gap = (distance_m - self._half_width_m) / pursuit.slow_obstacle_m
         # What is passed at the least speed costs more where it is nearer, so that the way is in the middle of a gap.
         speed_mps = pursuit.velocity_mps * np.clip(gap, MARGIN_M / pursuit.slow_obstacle_m, 1.0)
         speed_mps[around.is_unknown] = np.minimum(speed_mps[around.is_unknown], UNKNOWN_MPS)
-        # 2. A base that begins too near to something may leave, as far as it gets no nearer.
-        rows, columns = np.indices(room_m.shape)
+        # 2. A base that begins too near to an obstacle may drive away from it.
+        rows, columns = np.indices(distance_m.shape)
         own = np.s_[round(start[1]), round(start[0])]
         is_near = CELL_M * np.hypot(rows - start[1], columns - start[0]) < self._radius_m
-        least_m = np.where(is_near, np.minimum(self.room_m, room_m[own]), self.room_m)
-        cell_s = np.where(room_m < least_m, np.inf, CELL_M / speed_mps)
+        least_m = np.where(is_near, np.minimum(self.required_m, distance_m[own]), self.required_m)
+        cell_s = np.where(distance_m < least_m, np.inf, CELL_M / speed_mps)
         # 3. Only near the path, if one is given.
         if along is not None:
-            at = [index.clip(0, len(room_m) - 1) for index in around.grid.at(along)]
-            is_path = np.zeros(room_m.shape, bool)
+            at = [index.clip(0, len(distance_m) - 1) for index in around.grid.at(along)]
+            is_path = np.zeros(distance_m.shape, bool)
             is_path[at[0], at[1]] = True
             cell_s[distances_m(is_path) > self._settings.corridor_m] = np.inf
         cell_s[own] = CELL_M / pursuit.least_mps
@@ -185,5 +186,5 @@ class Planner:
 
 def _nearest_m(place: Array, around: Surroundings) -> float:
     """Return the distance of a place (2,) from the nearest obstacle; inf without one."""
-    nearest_m = float(around.room_at(place[None], around.closed_m)[0])
+    nearest_m = float(around.distance_at(place[None], around.closed_distance_m)[0])
     return nearest_m if nearest_m < FAR_M else math.inf

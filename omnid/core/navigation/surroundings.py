@@ -28,18 +28,17 @@ Flags = NDArray[np.bool_]
 
 FAR_M: Final = 1e3  # distance where there is no obstacle
 NEAR_M: Final = 1.2  # Floor nearer than that would be seen if it could be.
-HORIZON_S: Final = 4.0  # of a prediction; then it stays
-MEETING_S: Final = 0.6  # by which the base and what moves may be early or late
+HORIZON_S: Final = 4.0  # The prediction of a moving object ends after this time.
+MEETING_S: Final = 0.6  # The base or a moving object may be early or late by this time.
 LARGEST_SIGMA_M: Final = 0.15  # Most uncertainty of a prediction that is kept free: beyond it nothing would be free.
-OWN_M: Final = 0.25  # beyond its radius, cells are those of what moves
-TRAIL_S: Final = 0.5  # The grid shows what moves where it was for this time, because pairs vote.
-SPECK: Final = np.ones((3, 3), np.uint8)  # unknown floor that is smaller stops no base
-# Least change of the room between two points of a way.
-ROUNDING_M: Final = 0.1 * CELL_M
+OWN_M: Final = 0.25  # Cells belong to a moving object up to this distance beyond its radius.
+TRAIL_S: Final = 0.5  # The grid shows a moving object for this time where it was, because pairs vote.
+SPECK: Final = np.ones((3, 3), np.uint8)  # Smaller patches of unknown floor are ignored.
+ROUNDING_M: Final = 0.1 * CELL_M  # A smaller change of the distance between two points of a way is none.
 
 
 class Surroundings:
-    """The grid of a pair with the distances in it, and what moves; positions in odom."""
+    """The grid of a pair with the distances in it, and moving objects; positions in odom."""
 
     def __init__(
         self,
@@ -58,12 +57,12 @@ class Surroundings:
         self._state = np.array([(m.x_m, m.y_m, m.vx_mps, m.vy_mps) for m in moving]).reshape(-1, 4)
         self._radius_m = np.array([m.radius_m for m in moving])
         self._covariance = np.array([m.covariance for m in moving]).reshape(-1, 4, 4)
-        # 1. Obstacles at rest: what moves is left out, with its trail.
+        # 1. Obstacles at rest, without moving objects and their trails.
         is_occupied = states == OCCUPIED
         trail = self._state[:, :2] - TRAIL_S * self._state[:, 2:]
         is_own = _from_segments_m(self._places(is_occupied), trail, self._state[:, :2]) <= self._radius_m + OWN_M
         is_occupied[is_occupied] = ~is_own.any(axis=1)
-        self.room_m = distances_m(is_occupied)  # of each cell to the nearest obstacle
+        self.distance_m = distances_m(is_occupied)  # of each cell to the nearest obstacle
         # 2. Floor that is not known, and floor that was not seen although the base came near.
         self.is_unknown = states == UNKNOWN
         is_patch = cv2.morphologyEx(self.is_unknown.view(np.uint8), cv2.MORPH_OPEN, SPECK) > 0
@@ -80,13 +79,12 @@ class Surroundings:
         if ends is not None:
             is_end = self._cells(ends)
             self.is_unknown, is_unseen = self.is_unknown | is_end, is_unseen | is_end
-        self.closed_m = distances_m(
-            is_occupied | is_unseen
-        )  # of each cell to an obstacle or to floor that was not seen from near
+        # Of each cell to an obstacle, or to floor that was not seen from near.
+        self.closed_distance_m = distances_m(is_occupied | is_unseen)
 
     @property
-    def moves(self) -> bool:
-        """True if something moves."""
+    def has_moving(self) -> bool:
+        """True if there is a moving object."""
         return len(self._state) > 0
 
     def _places(self, flags: Flags) -> Array:
@@ -101,16 +99,19 @@ class Surroundings:
         flags[rows[inside], columns[inside]] = True
         return flags
 
-    def room_at(self, points: Array, of: Array | None = None) -> Array:
-        """Return the distance of points (N, 2) to the nearest obstacle, FAR_M outside the grid; of: other distances."""
-        of = self.room_m if of is None else of
+    def distance_at(self, points: Array, distances: Array | None = None) -> Array:
+        """Return the distance of points (N, 2) to the nearest obstacle, FAR_M outside the grid.
+
+        distances: of the cells; None: distance_m.
+        """
+        distances = self.distance_m if distances is None else distances
         rows, columns = self.grid.at(points)
-        size = len(of)
+        size = len(distances)
         inside = (np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < size)
-        return np.asarray(np.where(inside, of[rows.clip(0, size - 1), columns.clip(0, size - 1)], FAR_M))
+        return np.asarray(np.where(inside, distances[rows.clip(0, size - 1), columns.clip(0, size - 1)], FAR_M))
 
     def movers(self, now_ns: int) -> Array:
-        """Return position, velocity and radius (K, 5) of what moves, as predicted for now, with one sigma."""
+        """Return position, velocity and radius (K, 5) of moving objects, as predicted for now, with one sigma."""
         age_s = (now_ns - self.stamp_ns) * 1e-9
         t = age_s + 0.5 * HORIZON_S
         P = np.moveaxis(self._covariance, 0, 2)
@@ -119,30 +120,30 @@ class Surroundings:
         xy, velocity = self._state[:, :2], self._state[:, 2:]
         return np.column_stack([xy + age_s * velocity, velocity, radius_m])
 
-    def near_m(self, path: Array, now_ns: int, speed_mps: float, of: Array | None = None) -> Array:
-        """Return the distance (N,) of points of a path (N, 2) from what is in the way; of: as in `room_at`.
+    def path_distance_m(self, path: Array, now_ns: int, speed_mps: float, distances: Array | None = None) -> Array:
+        """Return the distance (N,) of points of a path (N, 2) from obstacles; distances: as in `distance_at`.
 
-        What moves counts where it is when the base, at a speed, is at a point.
+        A moving object counts where it is when the base, at a speed, reaches the point.
         """
-        near_m = self.room_at(path, of)
-        if not self.moves:
-            return near_m
+        at_rest_m = self.distance_at(path, distances)
+        if not self.has_moving:
+            return at_rest_m
         movers, times_s = self.movers(now_ns), _ways_m(path) / speed_mps
         early, late = (
             movers[:, :2] + np.clip(times_s + shift_s, 0.0, HORIZON_S)[:, None, None] * movers[:, 2:4]
             for shift_s in (-MEETING_S, MEETING_S)
         )
-        return np.asarray(np.minimum(near_m, (_from_segments_m(path, early, late) - movers[:, 4]).min(axis=1)))
+        return np.asarray(np.minimum(at_rest_m, (_from_segments_m(path, early, late) - movers[:, 4]).min(axis=1)))
 
-    def first_blocked_m(self, path: Array, room_m: float, now_ns: int, speed_mps: float) -> float:
-        """Return the way along a path (N, 2) to where something is nearer than a room; inf without one.
+    def first_blocked_m(self, path: Array, required_m: float, now_ns: int, speed_mps: float) -> float:
+        """Return the way along a path (N, 2) to where an obstacle is nearer than required_m; inf without one.
 
-        What the base is near to already, and drives away from, does not count.
+        An obstacle that the base is near to already, and drives away from, does not count.
         """
-        near_m = self.near_m(path, now_ns, speed_mps)
-        is_blocked = near_m < room_m
+        distance_m = self.path_distance_m(path, now_ns, speed_mps)
+        is_blocked = distance_m < required_m
         if is_blocked[0]:
-            leaves = np.minimum.accumulate(np.append(True, np.diff(near_m) > -ROUNDING_M))
+            leaves = np.minimum.accumulate(np.append(True, np.diff(distance_m) > -ROUNDING_M))
             is_blocked &= ~(leaves & np.minimum.accumulate(is_blocked))
         return float(_ways_m(path)[np.argmax(is_blocked)]) if is_blocked.any() else math.inf
 

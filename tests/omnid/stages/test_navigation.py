@@ -14,7 +14,7 @@ from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
 from omnid.core.mapping.range_scan import RangeScan
-from omnid.core.navigation.follower import STAND
+from omnid.core.navigation.follower import STANDSTILL
 from omnid.core.navigation.navigator import CROSSES
 from omnid.core.navigation.requests import (
     GoalRequest,
@@ -294,7 +294,7 @@ def test_after_a_reset_a_place_from_before_it_is_none(tmp_path: Path) -> None:
     robot.resets, robot.in_map = 1, False
     for _ in range(3):
         robot.pass_on()
-    assert robot.updates[-1].state is NavigationState.NOT_LOCALISED and robot.updates[-1].setpoint == STAND
+    assert robot.updates[-1].state is NavigationState.NOT_LOCALISED and robot.updates[-1].setpoint == STANDSTILL
     late = PlaceUpdate(1, PERIOD_NS, np.eye(4), np.eye(4), UNIT, MapState.LOCALIZED, 3, np.eye(4))
     robot.stage.process(late)
     answer = robot.send(GoalRequest(NavigationFrame.MAP, 1.0, 0.0)).answer

@@ -150,7 +150,7 @@ def test_the_path_is_blocked_where_the_base_meets_somebody(
     path = straight_leg((0.0, 0.0), (2.5, 0.0)).xy
     around = moving(*person)
     assert math.isfinite(around.first_blocked_m(path, 0.1, 0, 0.4)) is blocks
-    stands = float(around.room_at(np.array([[3.0, 0.0]]))[0])
+    stands = float(around.distance_at(np.array([[3.0, 0.0]]))[0])
     assert stands > 1.0 if person[:2] == (3.0, 0.0) else stands < 0.1
 
 
