@@ -72,7 +72,7 @@ def replay(
         )
         result = run_log(Path(log), loaded, options)
     if result.signal:
-        signal.raise_signal(result.signal)  # the run has ended in order: now the caller's own handler
+        signal.raise_signal(result.signal)  # The run has ended in order; the caller's own handler comes now.
     return replace(result, warnings=(*ignored, *result.warnings))
 
 
@@ -101,11 +101,11 @@ class Odometry:
             settings = _config(config, overrides)
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
-            place = geometry(loaded, settings.panorama)
+            run_geometry = geometry(loaded, settings.panorama)
             # `process` gets both images of a pair at once, whatever the time between their exposures.
-            together = replace(settings.pair, tolerance_ms=1e3 * MAX_SKEW_S)
-            self._front_end = FrontEnd(place, replace(settings, pair=together))
-        self.rig = place.rig
+            pair_config = replace(settings.pair, tolerance_ms=1e3 * MAX_SKEW_S)
+            self._front_end = FrontEnd(run_geometry, replace(settings, pair=pair_config))
+        self.rig = run_geometry.rig
         self._lock = Lock()
         self._seq = 0
         self._stamp_ns: int | None = None
@@ -124,10 +124,11 @@ class Odometry:
         (H, W) uint8. Points and disparities are those of the method `depth`.
 
         Raises OmnidError for an image of another type or size than the rig's, for a stamp that is not later than the
-        previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. Also for
-        an image that repeats an earlier one to the last pixel, unless pair.repeated_images is "use": a frozen camera
-        shows no motion, and a replay drops such a pair; later images are compared with those of this pair, too. And
-        where one of the first pairs shows that the images cannot be of this rig, unless rig.check says otherwise.
+        previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. Raises it
+        for an image that repeats an earlier one to the last pixel, unless pair.repeated_images is "use": a frozen
+        camera shows no motion, and a replay drops such a pair; later images are compared with those of this pair, too.
+        Raises it where one of the first pairs shows that the images cannot be of this rig, unless rig.check says
+        otherwise.
         """
         with self._lock:
             # 1. Refuse images and stamps that are no pair of this rig, before any state changes.

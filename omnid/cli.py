@@ -80,18 +80,18 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 128 + a signal."""
-    # OpenCV reads it when it is loaded: it refuses larger image files; by drivers.frame.MAX_PIXELS, which loads OpenCV.
+    # OpenCV reads this limit of images when it is loaded: drivers.frame.MAX_PIXELS, whose import would load OpenCV.
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
-    # numpy reads it when it is loaded: the matrices are small, and threads of BLAS wait for the next one without
+    # numpy reads this when it is loaded: the matrices are small, and threads of BLAS wait for the next one without
     # sleeping: see the row `libraries` of `OPENBLAS_NUM_THREADS=2 python -m tests.bench.daemon`.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if argv is None else argv)
-    if _completes():
+    if _is_completing():
         words = os.environ["COMP_LINE"].split()[1:]
-    if not words and not _completes():
+    if not words and not _is_completing():
         parser_of(words).print_help()
         return 0
-    with ExitStack() as handlers:  # of the time in which modules are loaded, when nothing is to be ended
+    with ExitStack() as handlers:  # A signal ends the program at once while modules are loaded.
         with suppress(ValueError):  # outside the main thread signals stay as they are
             handlers.enter_context(handle_stop_signals(lambda number, _: os._exit(128 + number)))
         args = parser_of(words).parse_args(words)
@@ -127,7 +127,7 @@ def parser_of(words: Sequence[str]) -> Parser:
     is_option = methodcaller("startswith", "-")
     leading = list(takewhile(lambda word: not is_option(word), dropwhile(is_option, words)))
     named = next((name for name in (" ".join(leading[:2]), *leading[:1]) if name in COMMANDS), None)
-    for name in COMMANDS if named is None or _completes() else (named,):
+    for name in COMMANDS if named is None or _is_completing() else (named,):
         first, _, second = name.partition(" ")
         if second and first not in parents:
             about = GROUPS[first]
@@ -137,7 +137,7 @@ def parser_of(words: Sequence[str]) -> Parser:
         leaf = parents[first if second else ""].add_parser(second or first, help=about)
         if name == named:
             command_at(place).add_to(leaf)
-    if _completes():
+    if _is_completing():
         with suppress(ImportError):  # the extra `completion`
             import argcomplete
 
@@ -151,7 +151,7 @@ def command_at(place: str) -> Command:
     return cast("Command", getattr(import_module(f"omnid.commands.{module}"), name or "run"))
 
 
-def _completes() -> bool:
+def _is_completing() -> bool:
     """True if the shell asks for completions of what is typed (argcomplete)."""
     return "_ARGCOMPLETE" in os.environ
 

@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
+ANSWER_S: Final = 10.0  # longer than writing a map or a route
 _TOPICS: Final[dict[type[Any], str]] = {
     Pose: "odom",
     Diagnostics: "status",
@@ -66,7 +66,7 @@ _QUALITY: Final[dict[str, Any]] = {
 
 
 class _Closing:
-    """What is closed at the end of a `with` block."""
+    """A context manager that calls `close` at the end of the block."""
 
     def __enter__(self) -> Self:
         return self
@@ -144,7 +144,7 @@ class Robot(_Closing):
         self.name = given.robot
         self._session = open_client(given)
         self._declared: list[object] = []  # zenoh undeclares what nothing refers to any longer
-        # The robot's own time less this computer's monotonic clock, as late as its answer came, and when it was asked.
+        # The robot's own time less this computer's monotonic clock, when its answer came; time of the query.
         self._offset_ns: int | None = None
         self._asked_s = -math.inf
 
@@ -205,9 +205,9 @@ class Robot(_Closing):
         return any(reply.ok is not None for reply in replies)
 
     def now_ns(self, *, waits: bool = False) -> int:
-        """Return the robot's own time, which senders attach, so that no clock of theirs matters; 0: it is not known.
+        """Return the robot's own time, which senders attach in place of their clocks; 0: it is unknown.
 
-        The robot is asked for it, at most once in CONNECT_S. waits: ask now, and wait for the answer of one there.
+        The robot is asked for it, at most once in CONNECT_S. waits: ask now, and wait for the answer.
         """
 
         def set_offset(reply: zenoh.Reply) -> None:

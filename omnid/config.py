@@ -118,7 +118,7 @@ class LiveConfig:
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
-    """Is the rig right? Checks of the images against it."""
+    """Checks of the images against the rig."""
 
     check: Annotated[
         Literal["refuse", "warn", "off"],

@@ -42,7 +42,7 @@ class FramePair:
     skew_s: float = 0.0  # upper minus lower exposure
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     jpeg_steps: tuple[Steps, Steps] = ((), ())  # of the quantisation of both JPEGs (drivers.jpeg), (): none
-    frames: tuple[Frame, ...] = ()  # of which the images were decoded
+    frames: tuple[Frame, ...] = ()  # frames from which the images were decoded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,7 @@ class OdometryUpdate:
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     is_keyframe: bool = False  # odometry needs its dense depth in any case
     conflict: Conflict = AGREE  # whether images, wheels and gyro show the same motion
-    image_fault: str = ""  # how the images of a camera are torn or displaced; empty: they are not
+    image_fault: str = ""  # fault of torn or displaced images of a camera; empty: none
     T_odom_rect: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) the same pose, as it was estimated
     # covariance of T_odom_rect, [t; r] in the rectified axes, without the errors of the rig
     covariance_rect: Array = field(default_factory=lambda: np.zeros((6, 6)))
@@ -137,8 +137,8 @@ class GridUpdate:
 class ObstacleScan:
     """Nearest obstacle in each direction from the base: sector k is about azimuth -pi + (k + 0.5) 2 pi / 360.
 
-    Ranges are from the base's origin, in the plane of its x (forward) and y (left). Unknown is not free: a plain
-    surface shows stereo nothing.
+    Ranges are from the base's origin, in the plane of its x (forward) and y (left). Unknown is not free:
+    stereo measures nothing on a plain surface.
     """
 
     seq: int

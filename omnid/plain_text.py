@@ -16,7 +16,7 @@ MOST_ENTRIES: Final = 64  # of parts in a status, and of values in a part
 def plain(text: str, most: int = MOST_CHARACTERS) -> str:
     """Return a text of printable characters, of which there are `most` at most."""
     shown = text[:most]
-    return shown if shown.isprintable() else "".join(map(_shown, shown))[:most]
+    return shown if shown.isprintable() else "".join(map(_escaped, shown))[:most]
 
 
 def one_line(message: object, most: int = MOST_CHARACTERS) -> str:
@@ -24,7 +24,7 @@ def one_line(message: object, most: int = MOST_CHARACTERS) -> str:
     return plain(" ".join(str(message).split()), most)
 
 
-def _shown(letter: str) -> str:
+def _escaped(letter: str) -> str:
     return letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
 
 

@@ -30,7 +30,7 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import plain, utc
-from omnid.recordings.evaluation import evaluate, turned_body
+from omnid.recordings.evaluation import body_rotation, evaluate
 from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader
 from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
@@ -115,7 +115,7 @@ def evaluate_run(args: argparse.Namespace) -> int:
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
     known: dict[str, object] = {}
     if args.frame == "auto":
-        T_rig_body = turned_body(estimate, truth, tolerance_s)
+        T_rig_body = body_rotation(estimate, truth, tolerance_s)
         truth = Trajectory(truth.stamps_ns, truth.T @ se3.inverse(T_rig_body))
         turn_deg = np.rad2deg(se3.rotation_log(T_rig_body[:3, :3]))
         known["turned_deg"] = [round(float(angle), 2) for angle in turn_deg]

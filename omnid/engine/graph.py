@@ -27,7 +27,7 @@ from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.process import handle_stop_signals
 
 Lock = threading.Lock
-POLL_S: Final = 0.1  # longest wait without a look at what ends it, as a signal in another thread wakes no main thread
+POLL_S: Final = 0.1  # Longest wait between two checks for an end: a signal in another thread wakes no main thread.
 RECENT: Final = 1000  # durations whose distribution is known: ten seconds of the controller's ticks
 T = TypeVar("T")
 In = TypeVar("In")
@@ -38,8 +38,8 @@ In_contra = TypeVar("In_contra", contravariant=True)
 END: Final = object()  # the last message of a stream
 
 
-def started(action: Callable[[], object], name: str) -> threading.Thread:
-    """Call an action in a thread, which does not keep the program from ending; what it raises is printed."""
+def run_in_thread(action: Callable[[], object], name: str) -> threading.Thread:
+    """Call an action in a daemon thread, and return the thread; an error is printed."""
     thread = threading.Thread(target=action, name=name, daemon=True)
     thread.start()
     return thread
@@ -57,7 +57,7 @@ class Poller:
     def __init__(self, action: Callable[[], object], period_s: float, name: str) -> None:
         self._action, self._period_ns = action, round(period_s * NS_PER_S)
         self._closing = False
-        self._thread = started(self._run, name)
+        self._thread = run_in_thread(self._run, name)
 
     def close(self) -> None:
         """End the calls; a running one ends first, unless this is it."""
@@ -70,7 +70,7 @@ class Poller:
             due_ns = time.monotonic_ns() + self._period_ns
             try:
                 self._action()
-            except Exception:  # the thread is the only way in for stops: it must not end by a defect elsewhere
+            except Exception:  # Stops arrive in such a thread: it must not end by a defect elsewhere.
                 traceback.print_exc(file=sys.stderr)
             sleep_until(due_ns, lambda: self._closing)
 
@@ -148,7 +148,7 @@ class Telemetry:
 
     def summary(self) -> dict[str, dict[str, float]]:
         """Return n (messages), drops, p50_ms, p99_ms and max_ms (time of one, NaN without any) by stage."""
-        return {one.name: {"n": one.processed, "drops": one.dropped, **one.wall.times_ms()} for one in self.stages}
+        return {s.name: {"n": s.processed, "drops": s.dropped, **s.wall.times_ms()} for s in self.stages}
 
 
 class Stage(Protocol[In_contra, Out_co]):
@@ -164,7 +164,7 @@ Sink: TypeAlias = Stage[In_contra, None]
 Output: TypeAlias = Sink[In_contra] | Callable[[In_contra], None]
 
 
-def nothing(*_: object) -> None:
+def no_op(*_: object) -> None:
     """Do nothing: used in place of a method that a stage does not have."""
 
 
@@ -172,7 +172,7 @@ class Stream(Generic[T_co]):
     """Output of a source or a stage, with any number of readers, which get each message in the order of the wiring."""
 
     def __init__(self, thread: str = "", depth: int = 0) -> None:
-        """thread: name of that in which the messages are pushed; empty: any. depth: see Graph.inlet; 0: of a stage."""
+        """thread: name of the thread that pushes the messages; empty: any. depth: see Graph.inlet; 0: of a stage."""
         self.thread, self.depth = thread, depth
         self.readers: list[Callable[[object], None]] = []
 
@@ -191,20 +191,21 @@ class _Node:
         self.stream: Stream[Any] = Stream(thread)
 
     def put(self, message: object) -> None:
-        """Process the message, and pass its result on; at the end of the last input what remains, and the end."""
+        """Process the message, and pass on its result; at the end of the last input, the remaining results and END."""
         graph, name = self._graph, self.stats.name
-        is_over = name in graph.failed
+        has_failed = name in graph.failed
         if message is END:
             self.writers -= 1
             if not self.writers:
-                with graph.watched(name):
-                    for result in () if is_over else getattr(self._work, "finish", nothing)() or ():
+                finish = no_op if has_failed else getattr(self._work, "finish", no_op)
+                with graph.catch_failure(name):
+                    for result in finish() or ():
                         self.stream.push(result)
                 self.stream.push(END)
-        elif is_over or not self.writers:
+        elif has_failed or not self.writers:
             self.stats.dropped += 1
         else:
-            with graph.watched(name):
+            with graph.catch_failure(name):
                 result = self.stats.timed(getattr(self._work, "process", self._work), message)
                 if result is not None:
                     self.stream.push(result)
@@ -213,8 +214,8 @@ class _Node:
 class _Inbox:
     """Bounded queues in front of a thread, from which it serves its nodes in the order of arrival.
 
-    One that is full lets the writer wait, or drops the oldest message of the stream, whose place in the order the next
-    one takes: none of two cameras takes the place of the other one's image.
+    A full queue lets the writer wait, or drops its oldest message and keeps the place in the order: no camera displaces
+    an image of the other one.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -223,7 +224,7 @@ class _Inbox:
         self._open = 0  # streams that have not ended
 
     def reader(self, node: _Node, depth: int, *, drops: bool) -> Callable[[object], None]:
-        """Return the function that adds a message of a stream for a node; the end of one always has room."""
+        """Return the function that adds a message of a stream for a node; END always has room."""
         waiting = deque[object]()
         self._open += 1
 
@@ -231,7 +232,7 @@ class _Inbox:
             with self._changed:
                 if message is not END and not drops:
                     self._changed.wait_for(lambda: len(waiting) < depth)
-                if waiting and waiting[-1] is END:  # from outside: it would take the place of the end
+                if waiting and waiting[-1] is END:  # A message from outside after END, which it would displace.
                     node.stats.dropped += 1
                     return
                 waiting.append(message)
@@ -275,14 +276,14 @@ class Graph:
         drops: bool = False,
         threaded: bool = True,
         depth: int = 2,
-        on_thread: Callable[[str], object] = nothing,
+        on_thread: Callable[[str], object] = no_op,
     ) -> None:
         self.telemetry, self.drops, self.threaded = Telemetry(), drops, threaded
         self._depth, self._on_thread = depth, on_thread
         self.lock = threading.Lock()  # of all inboxes
         self.idle = threading.Condition(self.lock)
-        self.waiting = 0  # messages in all inboxes, with those that are processed; under the lock
-        self._readers: dict[str, Callable[[], object]] = {}  # bodies of the threads of sources, by their names
+        self.waiting = 0  # messages in all inboxes and in process; under the lock
+        self._sources: dict[str, Callable[[], object]] = {}  # bodies of the threads of sources, by their names
         self._wakes: dict[str, Callable[[], None]] = {}
         self._inlets: list[Stream[Any]] = []
         self._inboxes: dict[str, _Inbox] = {}  # by thread
@@ -293,16 +294,14 @@ class Graph:
 
     # The wiring.
 
-    def source(
-        self, name: str, messages: Callable[[], Iterable[T]], *, wake: Callable[[], None] = nothing
-    ) -> Stream[T]:
+    def source(self, name: str, messages: Callable[[], Iterable[T]], *, wake: Callable[[], None] = no_op) -> Stream[T]:
         """Add a source: an iterable that is opened, read and closed in the source's own thread.
 
         `wake` is called once to end a threaded run early: it must end the current read and all later ones. Inline,
         sources are read one after the other.
         """
         stream: Stream[T] = Stream(name)
-        self._readers[name] = partial(self._read, self.telemetry.add(StageStats(name)), messages, stream)
+        self._sources[name] = partial(self._run_source, self.telemetry.add(StageStats(name)), messages, stream)
         self._wakes[name] = wake
         self._open_sources += 1
         return stream
@@ -321,8 +320,8 @@ class Graph:
     ) -> Stream[Out]:
         """Add a stage or a sink, whose inputs merge; return its output.
 
-        thread: name of that in which it runs, one of its own where it is empty. What comes from a stage or a source of
-        the same thread is passed on directly, without an inbox. depth: of its inbox, if not that of the graph.
+        thread: name of the thread in which it runs; empty: its own. Messages within a thread are passed on directly,
+        without an inbox. depth: of its inbox, if not that of the graph.
         """
         thread = thread or name
         node = _Node(self, self.telemetry.add(StageStats(name)), stage, len(inputs), thread)
@@ -345,21 +344,21 @@ class Graph:
         Raises the first error of any stage with later ones in its notes.
         """
         # 1. A thread for each source and each group of stages.
-        bodies = self._readers | {name: inbox.serve for name, inbox in self._inboxes.items()}
-        if not self.threaded:
-            bodies = {}
+        bodies = self._sources | {name: inbox.serve for name, inbox in self._inboxes.items()}
         threads = [threading.Thread(target=self._begin, args=body, name=body[0]) for body in bodies.items()]
+        if not self.threaded:
+            threads = []
         # 2. Run, and wait for the end of all.
         try:
             for thread in threads:
                 thread.start()
-            for read in () if self.threaded else self._readers.values():
-                read()
+            for run_source in () if self.threaded else self._sources.values():
+                run_source()
             self._join(threads)
-        except BaseException as error:  # from the caller's signal handler, or no thread could be started
+        except BaseException as error:  # A signal handler has raised it, or no thread could be started.
             self._errors.insert(0, error)
             self._join(threads)
-        # 3. What went wrong.
+        # 3. Raise the first error.
         for later in self._errors[1:]:
             self._errors[0].add_note(f"and then: {later!r}")
         if self._errors:
@@ -394,8 +393,8 @@ class Graph:
         return bool(self.signal or self._errors)
 
     @contextmanager
-    def watched(self, name: str) -> Iterator[None]:
-        """End the run by an error in this block of a stage, which counts as failed."""
+    def catch_failure(self, name: str) -> Iterator[None]:
+        """Keep an error of this block, end the run, and mark the stage as failed."""
         try:
             yield
         except BaseException as error:
@@ -407,12 +406,12 @@ class Graph:
         self._on_thread(name)
         body()
 
-    def _read(self, stats: StageStats, given: Callable[[], Iterable[object]], stream: Stream[Any]) -> None:
-        """Pass on the messages of a source; then its stream ends, and with the last one the inlets."""
+    def _run_source(self, stats: StageStats, begin: Callable[[], Iterable[object]], stream: Stream[Any]) -> None:
+        """Pass on the messages of a source; then end its stream, and after the last source the inlets."""
         messages = iter(tuple[object]())
-        with self.watched(stats.name):
+        with self.catch_failure(stats.name):
             try:
-                messages, start_ns = iter(() if self.is_stopping else given()), time.monotonic_ns()
+                messages, start_ns = iter(() if self.is_stopping else begin()), time.monotonic_ns()
                 for message in messages:
                     stats.wall.add((time.monotonic_ns() - start_ns) * S_PER_NS)
                     stats.processed += 1
@@ -421,7 +420,7 @@ class Graph:
                         break
                     start_ns = time.monotonic_ns()
             finally:
-                getattr(messages, "close", nothing)()
+                getattr(messages, "close", no_op)()
         stream.push(END)
         with self.lock:
             self._open_sources -= 1
@@ -436,5 +435,5 @@ class Graph:
                 thread.join(POLL_S)
                 while self.is_stopping and self._wakes:
                     name, wake = self._wakes.popitem()
-                    with self.watched(name):
+                    with self.catch_failure(name):
                         wake()

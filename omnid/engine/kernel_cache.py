@@ -28,7 +28,7 @@ def prepare_kernels(report: Report = log) -> None:
         for found in folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*"):
             if found != folder or not is_kept(name):  # of an earlier state of the file, or others could write to it
                 shutil.rmtree(found, ignore_errors=True)
-        folder.mkdir(mode=0o700, exist_ok=True)  # another program that has just begun may have made it
+        folder.mkdir(mode=0o700, exist_ok=True)  # Another program may just have made it.
     # 2. The code.
     try:
         for name in modules:
@@ -36,7 +36,7 @@ def prepare_kernels(report: Report = log) -> None:
         for kernel in DECLARED:
             if kernel.function.__module__ in modules:
                 kernel.compile(is_kept=True)
-    except Exception as error:  # what pickle and LLVM raise for files that a power cut has damaged
+    except Exception as error:  # Pickle and LLVM raise any error for damaged files.
         for name in modules:
             shutil.rmtree(code_folder(name), ignore_errors=True)
         text = f"what was compiled earlier is damaged ({error}); it is deleted now: start again"

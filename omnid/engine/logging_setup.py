@@ -36,7 +36,7 @@ def configure_logging() -> None:
 class StderrHandler(logging.Handler):
     """Writes records as single lines, above a line that a terminal keeps showing."""
 
-    _shown = ""  # line that is shown below the others on a terminal
+    _status = ""  # line that is kept below the others on a terminal
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record."""
@@ -44,19 +44,19 @@ class StderrHandler(logging.Handler):
         prefix = "omnid: warning: " if record.levelno == logging.WARNING else "omnid: "
         if is_journal(sys.stderr):  # priorities of syslog and journald (RFC 5424, section 6.2.1)
             prefix = f"<{ {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4}.get(record.levelno, 6) }>"
-        self._write(f"{_ERASE if self._shown else ''}{prefix}{one_line(name + record.getMessage(), 4000)}\n")
+        self._write(f"{_ERASE if self._status else ''}{prefix}{one_line(name + record.getMessage(), 4000)}\n")
 
     def show(self, line: str) -> None:
         """Keep a line below the others of a terminal until it is replaced; "" removes it."""
-        with suppress(OSError, ValueError):  # it is no terminal
+        with suppress(OSError, ValueError):  # stderr is no terminal
             columns = os.get_terminal_size(sys.stderr.fileno()).columns or 80  # 0: unknown
             # A longer line would fill a second row, which _ERASE does not reach.
-            self._shown = one_line(line, columns - 1)
+            self._status = one_line(line, columns - 1)
             self._write(_ERASE)
 
     def _write(self, text: str) -> None:
         with suppress(OSError, ValueError):  # a closed stream or a full disk must not end the program
-            sys.stderr.write(text + self._shown)
+            sys.stderr.write(text + self._status)
             sys.stderr.flush()
 
 

@@ -1,8 +1,8 @@
 """The time of a robot: CLOCK_MONOTONIC for all stamps inside, and its offset to Unix time, which is followed.
 
-A computer's clock is set while a robot runs: by NTP, by hand, at each boot of a board without a battery. Nothing inside
-changes by that: durations, ages, rates and deadlines are differences of CLOCK_MONOTONIC. On the bus and in recordings a
-stamp s is the Unix time
+A computer's clock is set while a robot runs: by NTP, by hand, at each boot of a board without a battery. Times inside
+omnid do not change by that: durations, ages, rates and deadlines are differences of CLOCK_MONOTONIC. On the bus and in
+recordings a stamp s is the Unix time
 
     unix(s) = s + offset(s)
 
@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Final
 
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
-from omnid.engine.graph import Lock, nothing
+from omnid.engine.graph import Lock, no_op
 
 STEP_NS: Final = 1_000_000  # less than two images of a pair are apart, more than NTP slews in a second
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
@@ -32,7 +32,7 @@ class RobotClock:
         self,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = lambda: time.time_ns(),
-        report: Callable[[str], object] = nothing,
+        report: Callable[[str], object] = no_op,
     ) -> None:
         """monotonic_ns: the clock of the stamps. unix_ns: the clock that may be set. report: takes a line at a step."""
         self.monotonic_ns, self._unix_ns, self._report = monotonic_ns, unix_ns, report
@@ -80,7 +80,7 @@ class RobotClock:
     def segment_unix_ns(self, stamp_ns: int) -> int:
         """Return the Unix time in a recording, whose files have no step in them: each step begins a new file.
 
-        What belongs to the time before a step, but comes after it, has the time of the new file.
+        A message from before a step that arrives after it has the time of the new file.
         """
         self.follow()
         return stamp_ns + self._offset_ns(max(stamp_ns, self._step_at_ns))
@@ -112,6 +112,6 @@ def log_time() -> RobotClock:
 
 
 def fixed_offset(clock_ns: Callable[[], int]) -> RobotClock:
-    """Return the clock of a simulated robot: it runs at its own pace from the Unix time of now on."""
+    """Return the clock of a simulated robot: it runs at its own pace from the present Unix time on."""
     offset_ns = time.time_ns() - clock_ns()
     return RobotClock(clock_ns, lambda: clock_ns() + offset_ns)

@@ -50,17 +50,17 @@ class Stick:
     _moved_s: float = -math.inf  # when the last arrow was pressed
 
     def press(self, data: bytes, now_s: float) -> None:
-        """Take the bytes of the keys pressed until now_s."""
+        """Process the bytes of the keys pressed until now_s."""
         for key in _KEY.findall(data):
             if key in ARROWS:
                 self._pressed_s[ARROWS[key]] = self._moved_s = now_s
             elif key in (b"+", b"=", b"-"):
                 self.share = self.share / 2 if key == b"-" else min(1.0, 2 * self.share)
-            elif key == b"a":  # not A, with which a key ends whose bytes come in parts
+            elif key == b"a":  # Not A, the last byte of an arrow whose bytes may come in parts.
                 self.arm_asked = True
             elif key in b"q\x04":
                 self.quit = True
-            else:  # space, and any key that means nothing: in doubt the wheels stop
+            else:  # Space, and any key without a meaning: in doubt the wheels stop.
                 self.stop_asked |= key == b" "
                 self._pressed_s.clear()
 
@@ -70,8 +70,8 @@ class Stick:
         forward, turn = ("forward" in held) - ("back" in held), ("left" in held) - ("right" in held)
         return (self.share * forward * self.limits.velocity_mps, self.share * turn * self.limits.yaw_rate_radps)
 
-    def commands(self, now_s: float) -> bool:
-        """Return True if there is a motion, or was one until a moment ago."""
+    def is_moving(self, now_s: float) -> bool:
+        """True if there is a motion, or was one less than HOLD_S ago."""
         return now_s - self._moved_s <= 2 * HOLD_S
 
 
@@ -87,7 +87,7 @@ def teleoperate(bus: BusConfig) -> int:
         driver, stick = robot.driver(), Stick(limits_of(robot))
         driver.require_connected()
         print("arrows: drive  space: stop  a: arm  +/-: speed  q: quit")
-        pressed_s = -math.inf  # keys that were typed while it connected still stop, arm and quit; motions are over
+        pressed_s = -math.inf  # Keys typed while it connected still stop, arm and quit, but cause no motion.
         try:
             status = ""
             while not stick.quit:
@@ -97,14 +97,14 @@ def teleoperate(bus: BusConfig) -> int:
                 if (report := statuses.newest()) is not None:
                     disarmed = report.value(WHEELS, Key.DISARMED_BY)
                     status = f"press a: not armed, {disarmed}" if disarmed else "armed"
-                # 2. What they ask for. The status has the answer to arming: the next key may be a stop.
+                # 2. Commands. Arming is not waited for, as the next key may be a stop: the status shows the answer.
                 if stick.stop_asked:
                     driver.stop()
                 elif stick.arm_asked:
                     driver.send(ARM, header_cdr(time.time_ns()))
                 stick.stop_asked = stick.arm_asked = False
                 velocity_mps, yaw_rate_radps = stick.twist(now_s)
-                if stick.commands(now_s):
+                if stick.is_moving(now_s):
                     driver.twist(velocity_mps, yaw_rate_radps)
                 speeds = f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s"
                 HANDLER.show(f"{speeds}  {100 * stick.share:.0f} %  {status}")

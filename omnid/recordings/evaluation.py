@@ -102,10 +102,10 @@ def same_times(estimate: Trajectory, truth: Trajectory, tolerance_s: float) -> t
     return estimate.T[of_estimate], truth.T[of_truth]
 
 
-def turned_body(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> Array:
-    """Return the pose T_rig_body (4, 4) of a body at the rig whose axes are turned, as those of an IMU may be.
+def body_rotation(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01) -> Array:
+    """Return T_rig_body (4, 4) of a body at the rig's origin with other axes, as an IMU may have: a pure rotation.
 
-    truth: that of the body. The worlds are aligned by all positions; its three angles are the mean over the poses.
+    truth: trajectory of the body. The worlds are aligned by all positions; the rotation is the mean over the poses.
     """
     (R, xyz), (true_R, true_xyz) = map(parts, same_times(estimate, truth, tolerance_s))
     R_odom_truth, _ = rotation_between(true_xyz - true_xyz.mean(axis=0), xyz - xyz.mean(axis=0))
@@ -141,9 +141,9 @@ def _rms(values: Array) -> float:
 
 
 def rotation_between(a: Array, b: Array) -> tuple[Array, Array]:
-    """Return the rotation R (3, 3) with b = R a for vectors (N, 3), by least squares, and how far it is determined.
+    """Return the rotation R (3, 3) with b = R a for vectors (N, 3), by least squares (Kabsch).
 
-    Kabsch's method: the second result (3,) holds the singular values of the covariance of both, the largest first.
+    The second result (3,) holds the singular values of the covariance of both, the largest first.
     """
     U, spread, Vt = np.linalg.svd(b.T @ a)
     return np.asarray(U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt), spread

@@ -17,14 +17,7 @@ from calib.errors import CalibError
 from calib.rig_file import parse_rig
 from omnid.formats.tum import POSITION_LIMIT_M
 from omnid.plain_text import MOST_ENTRIES
-from omnid.recordings.recording import (
-    CLOUD,
-    DRIVE,
-    ODOMETRY,
-    STATUS,
-    TWIST_COMMAND,
-    RecordingReader,
-)
+from omnid.recordings.recording import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
 from omnid.report.page import Array, Curve
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
@@ -55,7 +48,7 @@ _DIGITS: Final = str.maketrans("", "", "0123456789")
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened."""
+    """An event of a run."""
 
     start_s: float
     end_s: float
@@ -205,9 +198,9 @@ class RecordedRun:
             before = message
 
     def _counter_events(self, name: str) -> Iterator[Event]:
-        """Yield the rises of a part's counters of faults; the first value is from before the recording.
+        """Yield the rises of a part's counters of faults; the first value was counted before the recording.
 
-        One that rises again with the next report but one is the same event.
+        Rises at most 2.5 s apart are one event.
         """
         first_s = min(found[0][0] for found in self.by_name.values())
         for key in self.values(name):
@@ -215,7 +208,7 @@ class RecordedRun:
             if not (key in _COUNTERS or is_reason):
                 continue
             _, t_s, counts = self.curve("", name, key)
-            if is_reason and len(t_s) and t_s[0] > first_s:  # the first one of this reason
+            if is_reason and len(t_s) and t_s[0] > first_s:  # The counter of a reason appears with its first count.
                 t_s, counts = np.insert(t_s, 0, t_s[0]), np.insert(counts, 0, 0.0)
             rises = np.diff(counts)
             at = np.flatnonzero(rises > 0)

@@ -25,10 +25,10 @@ from omnid.version import __version__
 
 
 def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
-    """Return the page; true: T_world_rig of the rig. Raise OmnidError where its times are others."""
+    """Return the page; true: T_world_rig of the rig. Raise OmnidError where its stamps match no pose."""
     events = run.events()
     end_s = max(run.end_s, 1e-2)
-    # The times with one state, which are shaded in the charts: begin, end and rank.
+    # The spans with one state, which are shaded in the charts: begin, end and rank.
     begins = np.flatnonzero(np.diff(run.ranks, prepend=UNKNOWN))
     ends_s = np.append(run.t_s[begins[1:]], run.end_s)
     spans = zip(run.t_s[begins].tolist(), ends_s.tolist(), run.ranks[begins].tolist(), strict=False)
@@ -76,7 +76,7 @@ def _head(run: RecordedRun) -> list[str]:
     ]
 
 
-def _against(run: RecordedRun, truth: Trajectory) -> list[str]:
+def _truth_section(run: RecordedRun, truth: Trajectory) -> list[str]:
     """Return the errors of the rig's poses, as `omnid eval` prints them, and over time; the first pose is aligned."""
     T_rig_base, tolerance_s = se3.inverse(run.T_base_rig), 0.01
     stamps_ns = run.start_ns + np.rint(run.t_s * 1e9).astype(np.int64)
@@ -118,7 +118,7 @@ def _plan(run: RecordedRun, events: Sequence[Event]) -> list[str]:
     for x, y in sheet.pixels(xy[np.searchsorted(run.t_s, lost_s[:MOST_ENTRIES])]).astype(int).tolist():
         cv2.drawMarker(image, (x, y), BLACK, cv2.MARKER_TILTED_CROSS, 16, 3)
     draw_ends(image, sheet, xy[0], xy[-1])
-    # 4. The figure; the places of at most 1000 poses are for the pointer.
+    # 4. The figure, with the positions of at most 1000 poses for the pointer.
     chosen = np.unique(np.linspace(0, len(xy) - 1, 1000).astype(int))
     shares = sheet.pixels(xy[chosen]) / np.array(image.shape[1::-1])
     places = np.column_stack([run.t_s[chosen], shares]).round(4).tolist()
@@ -157,7 +157,7 @@ def _events_table(events: Sequence[Event], end_s: float) -> list[str]:
 
 
 def _clock(seconds: float, end_s: float) -> str:
-    """Return a time in words; end_s: of the run: of a short one in seconds, as in the charts."""
+    """Return a time as text: in seconds, as in the charts, if the end of the run (end_s) is below 300 s."""
     if end_s < 300:
         return f"{seconds:.2f}".rstrip("0").rstrip(".") + " s"
     minutes, rest_s = divmod(abs(seconds), 60)
@@ -174,7 +174,7 @@ def _sections(run: RecordedRun, true: Trajectory | None) -> Iterator[tuple[str, 
     """Yield title and parts of each section of charts and tables; a part is HTML, "" where the log has nothing."""
     # 1. Errors of the path.
     if true is not None:
-        yield "Against the truth", _against(run, true)
+        yield "Against the truth", _truth_section(run, true)
     # 2. Speed, yaw rate and height, and the commands.
     named = {DRIVE: "sent to the wheels", TWIST_COMMAND: "commanded"}
     moved = [("measured", run.t_s, run.velocity[:, 0], run.velocity[:, -1])]
@@ -187,7 +187,7 @@ def _sections(run: RecordedRun, true: Trajectory | None) -> Iterator[tuple[str, 
     yield "Motion", [grid(figures), "" if run.drives else note("The log holds no commands.")]
     # 3. Standard deviations of the covariances, and the landmarks.
     position_m, heading_rad = (
-        np.sqrt(np.where(variance > 0, variance, np.nan))  # one that is not positive was not set
+        np.sqrt(np.where(variance > 0, variance, np.nan))  # A variance that is not positive was not set.
         for variance in (run.variances[:, :3].sum(axis=1), run.variances[:, -1])
     )
     title, landmarks = "Standard deviation of the", {"tracked": Key.TRACKED, "inliers of the pose": Key.INLIERS}
@@ -212,16 +212,16 @@ def _sections(run: RecordedRun, true: Trajectory | None) -> Iterator[tuple[str, 
         chart("From the image to its pose", curves, "ms", note="Of all messages since the start of the run."),
     ]
     if rows or any(figures):
-        yield "Times and losses", [_words(titles, rows) if rows else "", grid(figures)]
+        yield "Times and losses", [_text_table(titles, rows) if rows else "", grid(figures)]
     if rows := [
         (short_name(name), entry.message, ", ".join(f"{key} {value}" for key, value in entry.values.items()))
         for name, entry in run.newest.items()
         if name != ODOMETRY and not name.startswith(STAGE_PREFIX)
     ]:
-        yield "Cameras, pairing, wheels", [_words(("part", "at the last report", "counters"), rows)]
+        yield "Cameras, pairing, wheels", [_text_table(("part", "at the last report", "counters"), rows)]
 
 
-def _words(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _text_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table of texts of the log."""
     cells = [[escape(cell) for cell in row] for row in rows]
     return f"<div class='words scroll'>{table(titles, cells)}</div>"

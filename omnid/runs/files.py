@@ -1,6 +1,6 @@
-"""What a run reads and writes beside its outputs: its map of places, and routes. No other thread waits for a disk.
+"""The map of places and the routes of a run: read at its start, and written.
 
-Both are read at the start. Stages of the thread of the files write them, and give the answers to requests for that.
+Stages of the thread of the files write them and answer the requests to do so: no other thread waits for a disk.
 """
 
 from __future__ import annotations
@@ -66,36 +66,36 @@ class RunPlaces:
             if rig.rig_hash != self._rig.rig_hash:
                 warn(f"{path}: the rig was calibrated again since this map was made")
             self._rig.adapt(self.places, rig)
-        self._known = frozenset(self.places.keyframes if self.places else ())
-        self.is_new = not self._known
-        # 2. What was saved, and requests for it.
+        self._loaded_ids = frozenset(self.places.keyframes if self.places else ())
+        self.is_new = not self._loaded_ids
+        # 2. Saves, and requests for them.
         self.written: Path | None = None
-        self._asked: deque[int] = deque(maxlen=MOST_OPEN)  # ids of requests
-        self._is_asked = False  # since the newest copy
+        self._request_ids: deque[int] = deque(maxlen=MOST_OPEN)  # to be answered by the next write
+        self._is_requested = False  # since the newest copy
         self._save_ns, self._copied_ns = round(settings.save_s * NS_PER_S), 0
         self._saved = frozenset[int]()  # keyframes in the file
-        self._saves, self._error = 0, ""  # number of saves; what the last one failed by
+        self._saves, self._error = 0, ""  # number of saves; error of the last one
 
     def ask(self, id: int) -> None:
         """Have the map written, and the request with this id answered; from any thread."""
-        self._asked.append(id)
-        self._is_asked = True
+        self._request_ids.append(id)
+        self._is_requested = True
 
     def copy(self, update: PlaceUpdate) -> PlaceMap | None:
         """Return a copy of the map after a pose, where it is due or was asked for."""
         self._copied_ns = self._copied_ns or update.stamp_ns
-        is_due = self._is_asked or update.stamp_ns - self._copied_ns >= self._save_ns
+        is_due = self._is_requested or update.stamp_ns - self._copied_ns >= self._save_ns
         if self.places is None or not is_due:
             return None
-        self._is_asked, self._copied_ns = False, update.stamp_ns
+        self._is_requested, self._copied_ns = False, update.stamp_ns
         return self.places.part(self.places.keyframes)
 
     def write(self, places: PlaceMap) -> Answers:
         """Write the joined part of a copy, where it is new; return the answers to the requests so far."""
-        ids = [self._asked.popleft() for _ in range(len(self._asked))]
+        ids = [self._request_ids.popleft() for _ in range(len(self._request_ids))]
         joined = self._joined(places)
         answer, self._error = Answer(True, "the map in the file has all that is known already"), ""
-        if joined - self._known and joined != self._saved:
+        if joined - self._loaded_ids and joined != self._saved:
             try:
                 self._write(places.part(joined))
                 self._saved, self._saves, answer = joined, self._saves + 1, Answer(True, "the map is saved")
@@ -115,14 +115,14 @@ class RunPlaces:
         if self.places is None:
             return
         joined = self._joined(self.places)
-        new, unjoined = len(joined - self._known), len(self.places.keyframes.keys() - joined - self._known)
-        if self._known and not new and unjoined:
+        new, unjoined = len(joined - self._loaded_ids), len(self.places.keyframes.keys() - joined - self._loaded_ids)
+        if self._loaded_ids and not new and unjoined:
             self._warn(f"{self._path}: no place of it was recognised: nothing was added to it")
         elif unjoined:
             self._warn(f"{self._path}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
         if self._is_extended and new:
             self._write(self.places.part(joined))
-        elif self._is_extended and not self._known:
+        elif self._is_extended and not self._loaded_ids:
             self._warn(f"{self._path}: no keyframe was found: no map was written")
 
     def _write(self, places: PlaceMap) -> None:
@@ -130,9 +130,9 @@ class RunPlaces:
         self.written = self._path
 
     def _joined(self, places: PlaceMap) -> frozenset[int]:
-        """Return the keyframes that links join to the map that was given, or else the largest part."""
+        """Return the keyframes that links join to those of the loaded map, or else the largest part."""
         found = places.parts() or [[]]
-        return frozenset(next((part for part in found if self._known.intersection(part)), found[0]))
+        return frozenset(next((part for part in found if self._loaded_ids.intersection(part)), found[0]))
 
 
 def place_rig(geometry: Geometry) -> PlaceRig:

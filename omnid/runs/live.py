@@ -123,7 +123,7 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         was_asked = line == ARMED or names.DISARMED_BY_STOP in line
         report(logging.INFO if was_asked else logging.WARNING, line)
 
-    if robot.waits:  # its time waits for the stages, so that nothing is dropped
+    if robot.waits:  # Its time waits for the stages, so that nothing is dropped.
         graph, clock = Graph(on_thread=partial(start_thread, {}, report)), fixed_offset(robot.clock_ns)
     else:
         priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
@@ -133,18 +133,13 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         session = Session(config, graph, outputs, warn, clock)
         # 1. The rig, and what is compiled or imported before the first image.
         geometry = session.geometry(rig or read_rig(Path(config.cameras.rig)), ())
-        compile_serialisers(
-            [
-                *(topic.schema for topic in topics.PUBLISHED.values()),
-                *(command.schema for command in topics.COMMANDS.values()),
-            ]
-        )
+        compile_serialisers([topic.schema for topic in (*topics.PUBLISHED.values(), *topics.COMMANDS.values())])
         prepare_kernels()
-        import_module("scipy.sparse.linalg")  # what the first loop needs
+        import_module("scipy.sparse.linalg")  # needed by the first loop closure
         outputs.enter_context(graph.signals())
         # 2. The connections, and the stages between them.
         health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
-        run_places = _join(session, FrontEnd(geometry, config, health), robot, report)
+        run_places = _connect(session, FrontEnd(geometry, config, health), robot, report)
         if geometry.rig.height_m(config.obstacles.scan.floor_m) is None:
             warn(FLOOR_WARNING)
         # 3. The status line of systemd and of a terminal.
@@ -163,12 +158,12 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
     return clock
 
 
-def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Report) -> RunPlaces:
+def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Report) -> RunPlaces:
     """Connect robot, bus and files, and wire the stages between them; return the map of places."""
     config, graph, clock, statistics = session.config, session.graph, session.clock, session.statistics
     rig, health, motion = front_end.geometry.rig, front_end.health, front_end.pairing.motion
 
-    # 1. What is outside: cameras and wheels, the bus, the map of places.
+    # 1. Cameras and wheels, the bus, the map of places.
     frames, controller = robot.connect(session, motion)
     bus = session.open_bus(rig, gives_time=robot.waits)
     run_places = RunPlaces(config, front_end.geometry, session.warn, saves=True)
@@ -177,14 +172,14 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         for id, words in answers.items():
             bus.answer(id, words)
 
-    # 2. Who takes what the stages make.
+    # 2. The sinks.
     reports = graph.inlet(1)  # the status
     exposure = ExposureControl(UsefulArea(rig, front_end.geometry.cylinder), config.cameras, robot.states)
     outputs = Outputs(
         pairs={"exposure": exposure},
         counters={"statistics": statistics},
         answers=answer,
-        # The ticks of wheels that wait give the time.
+        # The ticks of a simulated controller give the time.
         bus=BusSink(bus, session.encoder(rig), clock=VelocityCommand if robot.waits else None),
     )
     if config.record.enabled:
@@ -198,7 +193,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
 
     # 3. The stages. Samples of gyro and wheels come from the bus, unless they come with the images of a log or of a
     #    simulation, whose motion others would not fit; a motor controller gives those of its wheels.
-    takes = {
+    is_subscribed = {
         topics.IMU: config.motion.imu != "off" and not robot.brings_samples,
         topics.WHEEL_ODOM: config.motion.wheels != "off" and not robot.brings_samples,
     }
@@ -209,7 +204,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         outputs.scans["controller-scan"] = lambda scan: controller.send(controller_scan(scan))
         states = controller.statistics.states = graph.inlet(1, thread="drive")
         graph.sink("arming", partial(_answer_arming, bus), states, thread=states.thread)
-        if takes.pop(topics.WHEEL_ODOM):
+        if is_subscribed.pop(topics.WHEEL_ODOM):
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         navigation = graph.inlet(topics.MOST_OPEN), states
@@ -235,7 +230,7 @@ def _join(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Repor
         is_unique=lambda: bus.is_unique,
         navigate=ask if controller is not None else None,
         save_map=run_places.ask if run_places.saves else None,
-        sensors={topic: partial(add_sample, topic) for topic, is_taken in takes.items() if is_taken},
+        sensors={topic: partial(add_sample, topic) for topic, is_on in is_subscribed.items() if is_on},
         why_not=dict.fromkeys(topics.COMMANDS, NO_MOTOR)
         | {topics.MAP: NO_MAP_FILE, **dict.fromkeys(topics.SENSOR_TOPICS, NO_SAMPLES)},
         report=session.warn,

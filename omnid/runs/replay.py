@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,15 @@ class ReplayOptions:
         return [(f"--{name.replace('_', '-')}", path) for name in names if (path := getattr(self, name)) is not None]
 
 
+class CollectedPose(NamedTuple):
+    """A pose that is kept for the result, see RunResult."""
+
+    stamp_ns: int
+    T_odom_rig: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    state: TrackingState
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RunResult:
     """Poses, map, counters, timings and warnings of a run.
@@ -96,7 +105,7 @@ class RunResult:
     states: tuple[TrackingState, ...]  # (N,)
     counters: RunCounters
     timings: Mapping[str, Mapping[str, float]]  # by stage: n (messages), drops, p50_ms, p99_ms and max_ms of one
-    warnings: tuple[str, ...]  # doubts about the input and what to do about them, one line each
+    warnings: tuple[str, ...]  # problems of the input, with remedies, one line each
     map: MapPoints | None  # points (M, 3) m in odom, with confidence, frames and age; None without a pair
     signal: int = 0  # number of the signal that ended the run early; 0: it came to its end
     # Poses in the map: by the map at the end, and as known while driving (live) with the states then. Empty if places
@@ -164,21 +173,21 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         # 2. The log and its rig; compiling may take a minute, so that a log or a rig that is wrong is refused first.
         warnings = list[str]()
         session = Session(config, graph, closing, warnings.append)
-        given = read_rig(options.rig) if isinstance(options.rig, Path) else options.rig
+        given_rig = read_rig(options.rig) if isinstance(options.rig, Path) else options.rig
         cameras = LogCameras(*options.topics, config.cameras.bits, config.log.rate_hz, config.log.time)
-        topics = given.topics if given else ("", "")
+        topics = given_rig.topics if given_rig else ("", "")
         named_motion = {"auto": None, "off": ""}  # None: the only topic of the log, "": none
         motion = MotionTopics(*(named_motion.get(name, name) for name in (config.motion.wheels, config.motion.imu)))
         reader = LogReader(log, cameras, topics, span_s=options.span_s, motion=motion)
         closing.callback(reader.close)
-        geometry = session.geometry(given or attached_rig(reader, log), reader.frames())
+        geometry = session.geometry(given_rig or attached_rig(reader, log), reader.frames())
         prepare_kernels()
         front_end = FrontEnd(geometry, config)
         run_places = RunPlaces(config, geometry, session.warn)
 
         # 3. The outputs; one that cannot be opened ends the run before it begins. A pose that is kept, with its
         #    covariance, takes 0.7 kB: 75 MB an hour at 30 Hz.
-        poses = list[tuple[int, NDArray[np.float64], NDArray[np.float64], TrackingState]]()
+        poses = list[CollectedPose]()
         updates, newest_map = list[PlaceUpdate](), deque[MapUpdate](maxlen=1)
         rig = geometry.rig
         recorder: Recorder | None = None
@@ -187,7 +196,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         outputs = Outputs(counters={"statistics": session.statistics})
         if options.collect:
             outputs.poses["collect-poses"] = lambda pose: poses.append(
-                (pose.stamp_ns, pose.T_odom_rig, pose.covariance, TrackingState(pose.state))
+                CollectedPose(pose.stamp_ns, pose.T_odom_rig, pose.covariance, TrackingState(pose.state))
             )
             outputs.maps["collect-map"] = newest_map.append
         if options.tum:
@@ -219,12 +228,12 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             closing.callback(show, True)
             session.every(POLL_S, partial(show, False), "progress")
 
-        # 4. The run, and what it has counted.
+        # 4. The run, and its counters.
         begun_s = time.monotonic()
         with graph.signals():
             run_to_end(graph, run_places)
         found, read, paired = session.statistics, reader.counts, front_end.pairing.counts
-        # All that was lost, by reason, zeros too.
+        # Losses by reason, zeros too.
         drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
         drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
         drops["broken"] += paired["broken"]
@@ -247,21 +256,22 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             recorder.process(Diagnostics(recorder.newest_ns, tuple(statuses)))
             recorder.close()
 
-        # 5. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
+        # 5. Poses in the map: corrected by its later loops, and as they were known while driving.
         places = stages.places
-        now = [] if places is None else [places.corrected(each) for each in updates]
-        in_map, live = (np.array(T, float).reshape(-1, 4, 4) for T in (now, [each.T_map_rig for each in updates]))
+        corrected = [] if places is None else [places.corrected(each) for each in updates]
+        in_map = np.array(corrected, float).reshape(-1, 4, 4)
+        live = np.array([each.T_map_rig for each in updates], float).reshape(-1, 4, 4)
         if options.map_tum and places is not None:
             stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
             warnings += write_trajectory(options.map_tum, stamps_ns, in_map, places.known(updates))
         return RunResult(
-            np.array([pose[0] for pose in poses], np.int64),
-            np.array([pose[1] for pose in poses], np.float64).reshape(-1, 4, 4),
-            np.array([pose[2] for pose in poses], np.float64).reshape(-1, 6, 6),
-            tuple(pose[3] for pose in poses),
+            np.array([pose.stamp_ns for pose in poses], np.int64),
+            np.array([pose.T_odom_rig for pose in poses], np.float64).reshape(-1, 4, 4),
+            np.array([pose.covariance for pose in poses], np.float64).reshape(-1, 6, 6),
+            tuple(pose.state for pose in poses),
             counters,
             graph.telemetry.summary(),
-            (*dict.fromkeys(warnings), *_about_input(session, reader, front_end, stages, counters)),
+            (*dict.fromkeys(warnings), *_run_warnings(session, reader, front_end, stages, counters)),
             newest_map[0].points if newest_map else None,
             graph.signal,
             in_map,
@@ -286,7 +296,7 @@ def _paced(reader: LogReader, graph: Graph, motion: MotionInbox) -> Iterator[Fra
             yield message
 
 
-def _about_input(
+def _run_warnings(
     session: Session, reader: LogReader, front_end: FrontEnd, stages: WiredStages, counters: RunCounters
 ) -> Iterator[str]:
     """Yield warnings about the log and the images."""

@@ -23,7 +23,7 @@ from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.diagnostics.status import RunStatistics
-from omnid.engine.graph import Graph, Output, Poller, StageStats, Stream, started
+from omnid.engine.graph import Graph, Output, Poller, StageStats, Stream, run_in_thread
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
@@ -112,7 +112,7 @@ class Session:
         bus = Bus(self.config.bus, self.warn, gives_time=gives_time)
 
         def close() -> None:
-            closing = started(bus.close, "bus-close")
+            closing = run_in_thread(bus.close, "bus-close")
             closing.join(BUS_S)  # zenoh waits for subscribers that do not read, for 10 s; a service has less time
             if closing.is_alive():
                 self.warn(f"the bus has not closed within {BUS_S:g} s: a subscriber does not read")

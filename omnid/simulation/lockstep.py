@@ -25,7 +25,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
-from omnid.engine.graph import Graph, Output, nothing
+from omnid.engine.graph import Graph, Output, no_op
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.files import RunPlaces
@@ -124,7 +124,7 @@ def simulate(
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does. vehicle: makes the robot; `Vehicle`, or one with faults.
     """
-    prepare_kernels(nothing)
+    prepare_kernels(no_op)
     # 1. The robot, and the lists of what it does.
     config, rig = config or Config(), robot.rig
     run, truth = SimulatedRun(rig.T_base_rig), dict[int, Array]()  # T_world_base by the stamp of a pair [ns]
@@ -143,7 +143,7 @@ def simulate(
     newest = deque[OdometryUpdate](maxlen=1)
 
     def messages() -> Iterator[Frame | MotionSample]:
-        for pair in islice(body.pairs(nothing), int(seconds * robot.rate_hz)):
+        for pair in islice(body.pairs(no_op), int(seconds * robot.rate_hz)):
             if send():
                 break
             truth[pair.stamp_ns] = body.T_world_base
@@ -195,7 +195,7 @@ def simulate(
             body.post(TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER), due_ns)
 
     # 3. The run.
-    run_places = RunPlaces(config, front_end.geometry, nothing)
+    run_places = RunPlaces(config, front_end.geometry, no_op)
     inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=(requests, states))
     in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
     outputs = Outputs(

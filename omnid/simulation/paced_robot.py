@@ -24,7 +24,7 @@ from omnid.controller.link import ControllerStatistics, DriveLink
 from omnid.core.control.arming import NO_CONTACT, ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
-from omnid.engine.graph import StageStats, Stream, nothing, sleep_until
+from omnid.engine.graph import StageStats, Stream, no_op, sleep_until
 from omnid.runs.wiring import Session
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
@@ -42,7 +42,7 @@ class PacedRobot:
         """Set the robot up, with the controller of the settings."""
         self.rig, self._motion = robot.rig, config.motion
         self._start_ns = self._first_ns = time.monotonic_ns()  # of the computer when the first pair was given, too
-        self._report: Callable[[str], None] = nothing
+        self._report: Callable[[str], None] = no_op
         self._vehicle = Vehicle(
             world,
             replace(robot, samples=1),
@@ -125,7 +125,7 @@ class PacedRobot:
                     self.states[frame.camera].frames += 1
                     yield frame
         finally:
-            self._report = nothing  # no more poses come then, which needs no line
+            self._report = no_op  # That no more poses come then needs no line.
             vehicle.come_to_rest()
             self.end()
 

@@ -1,4 +1,4 @@
-"""What brings poses and setpoints to the controller, on the robot and in a replay."""
+"""Sinks that send poses and setpoints to the controller, on the robot and in a replay."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from omnid.messages import NavigationUpdate, OdometryUpdate
 from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer, Answers
 
-NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
+NAVIGATION_SENDER: Final = "navigation"  # identity of the sender, which keeps other programs off its source
 NO_MOTOR: Final = (
     "the motor controller does not answer any more; its own watchdog stops the wheels: check its power and its cable"
 )
 
 
 class LiveDrive:
-    """Pass the poses of `omnid run` on; setpoints come from the network."""
+    """Sends the poses of `omnid run` to the controller; setpoints come from the network."""
 
     def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64]) -> None:
         self._link, self._T_base_rig = link, T_base_rig
@@ -43,13 +43,13 @@ class LiveDrive:
 
 
 def send_setpoint(link: DriveLink, update: NavigationUpdate) -> None:
-    """Send the setpoint of the navigation as of now, which a source of higher priority keeps out."""
+    """Send the setpoint of the navigation, with a stamp of now; a source of higher priority overrides it."""
     if update.setpoint is not None:
         link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
 
 
 def navigation_answers(update: NavigationUpdate) -> Answers | None:
-    """Return the answer to the newest request to the navigation; to give one again does nothing."""
+    """Return the answer to the newest request to the navigation; a repeated answer has no effect."""
     if update.answer is None:
         return None
     refusal, state = update.answer.refusal, f"{update.state}: {update.reason}" if update.reason else str(update.state)
@@ -59,14 +59,14 @@ def navigation_answers(update: NavigationUpdate) -> Answers | None:
 class ReplayDrive:
     """Drive the base with the poses of a replay and the setpoint of the configuration.
 
-    The controller runs in real time whatever the pace of the replay: a pose counts as captured when it arrives here,
+    The controller runs in real time at any speed of the replay: a pose counts as captured when it arrives here,
     and renews the setpoint. A replay that gives no pose for the deadlines' time stops the wheels, as a robot does.
     """
 
     def __init__(
         self, link: ControllerLink, setpoint: Setpoint, T_base_rig: NDArray[np.float64], health: RigHealth
     ) -> None:
-        """health: of the rig; the wheels stand until the first pairs have shown whether it is right."""
+        """health: of the rig; the wheels stay stopped until the first pairs have shown whether it is right."""
         self._link, self._setpoint, self._T_base_rig = link, setpoint, T_base_rig
         self._health, self._has_begun = health, False
 
@@ -82,7 +82,7 @@ class ReplayDrive:
                 raise DriverError(NO_MOTOR)
 
     def finish(self) -> None:
-        """Have the wheels slow down to a stop, and take the last reports."""
+        """Have the wheels slow down to a stop, and receive the last reports."""
         self._link.end()
         for _ in self._link.commands():
             pass
@@ -97,7 +97,7 @@ def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -
     """Return the part of a pose that the controller needs; one that is not finite is LOST."""
     T_odom_base, _, velocity, covariance = of_base(odometry, T_base_rig)
     heading_rad, velocity_mps, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[0]), float(velocity[5])
-    # The order of max: it returns its first argument where that is NaN.
+    # NaN must come first: `max` returns its first argument then.
     sigma_mps, sigma_radps = (math.sqrt(max(float(covariance[axis, axis]), 0.0)) for axis in (0, 5))
     finite = all(map(math.isfinite, (heading_rad, velocity_mps, rate_radps, sigma_mps, sigma_radps)))
     return ControllerPose(

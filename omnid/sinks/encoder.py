@@ -1,4 +1,4 @@
-"""Poses, commands and maps as ROS 2 messages (topic, schema, CDR bytes) for the bus and for logs; what is published."""
+"""Poses, commands and maps as ROS 2 messages (topic, schema, CDR bytes) for the bus and for logs, and their sinks."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def _on(topic: str, payload: bytes) -> OutgoingMessage:
 
 
 class Encoder:
-    """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's.
+    """Encodes messages for ROS 2; their frame odom is the base's at the first pair, not the rig's.
 
-    What changes seldom comes before the message that changes it: the static frames before the first pose, and a status
-    when the state of odom, or in the map, is another one. Its stamp is that of the pose.
+    The static frames come before the first pose, and a status before a pose whose state in odom or in the map is
+    another one, with the stamp of the pose.
     """
 
     def __init__(
@@ -67,14 +67,14 @@ class Encoder:
         rig: Rig | None = None,
         scan_range_m: float = 6.0,
     ) -> None:
-        """cloud_points: the largest number of points of the cloud; of more, evenly many are left out.
+        """cloud_points: the largest number of points of the cloud; a larger one is thinned evenly.
 
         unix_ns: returns the Unix time of a stamp of the messages; that of a log is Unix time already. rig: with the
         mounting of the cameras, for the static frames; None: they are left out.
         """
         self.T_base_rig, self.unix_ns, self._rig = T_base_rig, unix_ns, rig
         self._cloud_points, self._scan_range_m = cloud_points, scan_range_m
-        self.run_id = ""  # of the run, where others record it; a log of one's own holds one run
+        self.run_id = ""  # identity of the run, for other programs' recordings; an own log holds one run
         self.repeat_states()
 
     def repeat_states(self) -> None:
@@ -114,7 +114,7 @@ class Encoder:
                     yield _on("plan", codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad))
 
     def _poses(self, odometry: OdometryUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
-        # 1. The frames that do not move on the robot: base_link -> rig -> lower and upper camera; the state.
+        # 1. The static frames: base_link -> rig -> lower and upper camera; the state.
         if self._state is None:
             edges = [("base_link", "rig", self.T_base_rig)]
             if self._rig is not None:
@@ -156,7 +156,7 @@ class Encoder:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
         pose = (T_map_base, np.ravel(in_outer_axes(T_map_base, covariance)))
         yield _on(MAP_POSE, codec.encoded(codec.MAP_POSE_SCHEMA, (stamp_ns, "map"), pose))
-        if update.is_known:  # a transform has no covariance that could say that it is not
+        if update.is_known:  # A transform has no covariance to state that it is unknown.
             T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
             yield _on("/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)]))
 
@@ -186,7 +186,7 @@ class BusSink:
     """Publishes encoded messages; live, its inbox drops the oldest, because the bus may be slow."""
 
     def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
-        """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
+        """clock: type of the messages, of one thread, whose stamps advance /clock; None: there is no /clock."""
         self._clock, self._time_ns = clock, 0
         self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
         self._bus, self._encode, encode.run_id = bus, encode, RUN_ID
@@ -201,7 +201,7 @@ class BusSink:
         attachment = pose_attachment(message, time.time_ns(), RUN_ID) if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
-        # 3. The path of the base, from time to time, for those who come after a drive.
+        # 3. The path of the base each PATH_NS, for subscribers that connect later.
         if isinstance(message, OdometryUpdate):
             T_base_rig = self._encode.T_base_rig
             T_odom_base = T_base_rig @ message.T_odom_rig @ se3.inverse(T_base_rig)

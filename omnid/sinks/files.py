@@ -37,7 +37,7 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             wrong = "expected a file to write, found a folder"
         elif not path.parent.is_dir():
             wrong = f"there is no folder {path.parent}"
-        elif path.exists() and not path.is_file():  # not opened: a pipe that is opened would end its reader
+        elif path.exists() and not path.is_file():  # Not opened, because that would end the reader of a pipe.
             wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
         elif (other := used.setdefault(_identity(path), option)) != option:
             wrong = f"this is {other} as well"
@@ -77,7 +77,7 @@ class TrajectoryFile:
                 lock(self._file)
             written = self._file.write(row)
             if written != len(row):
-                self._file.truncate(self._file.tell() - written)  # A part of a row is none.
+                self._file.truncate(self._file.tell() - written)  # Remove the part of a row.
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error
@@ -94,13 +94,13 @@ def write_trajectory(
     poses: NDArray[np.float64],
     known: NDArray[np.bool_] | None = None,
 ) -> list[str]:
-    """Write poses (N, 4, 4) as TUM, of those in a map the known ones (N,); return warnings about the others.
+    """Write poses (N, 4, 4) as TUM; return warnings. known (N,): of poses in a map, those to be written; None: all.
 
     Without poses an existing file stays as it is. Raises OmnidError.
     """
     known = np.ones(len(stamps_ns), bool) if known is None else known
     file = TrajectoryFile(path)
-    if len(known) and not known.any():  # no result is an empty file, not that of an earlier run
+    if len(known) and not known.any():  # The file of an earlier run must not pass for the result.
         path.write_bytes(b"")
     try:
         for stamp_ns, T, is_known in zip(stamps_ns.tolist(), poses, known, strict=True):

@@ -46,8 +46,8 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | WheelState | NavigationCommand
 
-REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
-SCAN_NS = 2_000_000_000  # older scans show nothing of now: the collision monitor then stops the base
+REPEAT_NS = NS_PER_S  # An unchanged state is published again after this time.
+SCAN_NS = 2_000_000_000  # Older scans are not used; the collision monitor then stops the base.
 
 
 class NavigationStage:
@@ -81,18 +81,18 @@ class NavigationStage:
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self.keyframes = MapKeyframes({}, {})
-        self._tie: tuple[int, Array] | None = None  # id of the newest keyframe, and its pose (3,) in the map
+        self._newest_keyframe: tuple[int, Array] | None = None  # its id and pose (3,) in the map
         self._reset_ns = -1  # stamp of the pose at which odometry began again
         self._scan: ObstacleScan | None = None
-        self._around: Surroundings | None = None  # by the newest scan that was used
+        self._around: Surroundings | None = None  # from the newest scan that was used
         self._recorder: RouteRecorder | None = None  # of the route that is taught
-        self._taught: TaughtRoute | None = None  # the last one
+        self._taught: TaughtRoute | None = None  # the last route that was taught
         self._taught_resets = 0  # resets of odometry when the recording began
         self._seq = 0
         self._answer: RequestAnswer | None = None  # to the newest request
         self._plan: NavigationPlan | None = None  # plan that is not yet part of a message
-        self._given: tuple[object, ...] = ()  # the state that was given last
-        self._given_ns = -REPEAT_NS
+        self._published: tuple[object, ...] = ()  # the newest published state
+        self._published_ns = -REPEAT_NS
 
     def process(self, message: NavigationInput) -> NavigationUpdate | None:
         """Return the motion at a pose, or the answer to a request; None where nothing is to be sent or has changed."""
@@ -110,12 +110,12 @@ class NavigationStage:
         return None
 
     def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
-        # 1. After a reset forget the pose in the map and what is about the base: they are of another odom.
+        # 1. After a reset forget the pose in the map and the surroundings: they are of another odom.
         self._seq = odometry.seq
         if self._now is not None and self._now.resets != odometry.reset_counter:
             self._in_map, self._reset_ns = None, odometry.stamp_ns
             self._scan = self._around = None
-        # 2. Put together where the base is and what is about it.
+        # 2. Collect the pose of the base and its surroundings.
         T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
         self._now = now = Situation(
             odometry.stamp_ns,
@@ -133,10 +133,10 @@ class NavigationStage:
         return self._update(self._navigator.step(now))
 
     def _surroundings(self, now_ns: int) -> Surroundings | None:
-        """Return what the newest scan shows; None if it is too old, or nothing is under way."""
+        """Return the surroundings by the newest scan; None if it is too old, or without a drive."""
         scan, before = self._scan, self._around
-        is_young = scan is not None and 0 <= now_ns - scan.stamp_ns <= SCAN_NS
-        if self._navigator.drive is None or scan is None or scan.grid is None or not is_young:
+        is_recent = scan is not None and 0 <= now_ns - scan.stamp_ns <= SCAN_NS
+        if self._navigator.drive is None or scan is None or scan.grid is None or not is_recent:
             return None
         if before is None or before.stamp_ns != scan.stamp_ns:
             pose = planar(scan.T_odom_base)
@@ -153,11 +153,11 @@ class NavigationStage:
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(in_plane)[-1]), 0.0))  # NaN stays NaN in this order
         self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m, update.stamp_ns)
         T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
-        self._tie = update.keyframe, planar(T_map_keyframe)
+        self._newest_keyframe = update.keyframe, planar(T_map_keyframe)
         self.keyframes = update.keyframes or self.keyframes
 
     def _request(self, command: NavigationCommand) -> NavigationUpdate:
-        """Execute a request; return the new state with the answer. Who writes a finished route answers for it."""
+        """Execute a request; return the new state with the answer, which for a finished route its writer gives."""
         navigator, word, taught, refusal = self._navigator, _word(command), self._taught, ""
         try:
             self._execute(command)
@@ -219,17 +219,17 @@ class NavigationStage:
     def _repeated(self, request: RouteRequest) -> list[DrivePath]:
         """Return the paths of a repetition."""
         self._require_map()
-        route = self._routes.get(request.name)
+        route, keyframes = self._routes.get(request.name), self._keyframe_poses()
         if route is None:
             raise OmnidError(f"there is no route {request.name}; routes: {', '.join(self._routes) or 'none'}")
-        if not route.fits(self._keyframe):
+        if not route.fits(keyframes):
             raise OmnidError(
                 f"the route {request.name} was taught in the map {route.map_name} as it was then: start with "
                 "that map (`omnid run --map`), or teach it again"
             )
         return repeated_paths(
             route,
-            self._keyframe,
+            keyframes,
             self._pose_in(NavigationFrame.MAP),
             loops=request.loops,
             reverse=request.reverse,
@@ -252,8 +252,8 @@ class NavigationStage:
 
     def _record(self, now: Situation) -> None:
         """Add the newest pose to the route that is being taught, where it is known in the map."""
-        recorder, tie, in_map = self._recorder, self._tie, now.in_map
-        if recorder is None or tie is None or in_map is None or in_map.state is MapState.LOST:
+        recorder, keyframe, in_map = self._recorder, self._newest_keyframe, now.in_map
+        if recorder is None or keyframe is None or in_map is None or in_map.state is MapState.LOST:
             return
         try:
             if now.resets != self._taught_resets and in_map.state is not MapState.LOCALIZED:
@@ -261,17 +261,17 @@ class NavigationStage:
                     f"odometry has begun again, so that the way of the route {recorder.name} is not known: teach it "
                     "again"
                 )
-            recorder.add(now.pose_in(NavigationFrame.MAP), now.speed_mps, *tie)
+            recorder.add(now.pose_in(NavigationFrame.MAP), now.speed_mps, *keyframe)
         except OmnidError as error:
             self._recorder = None
             self._answer = RequestAnswer(0, "teach", str(error))
 
     def _finish(self, command: NavigationCommand) -> None:
-        """Have the recorded route written; asked for again, the last one is written again, as a disk may be full."""
+        """Pass the recorded route on to be written; without one the last route again, whose disk may have been full."""
         self._require_map(teaches=True)
         if self._recorder is not None:
             created_s = command.arrival_ns // NS_PER_S
-            route = self._recorder.route(self._keyframe, self.keyframes.stamps_ns, created_s, self.map_name)
+            route = self._recorder.route(self._keyframe_poses(), created_s, self.map_name)
             self._recorder, self._routes[route.name] = None, route
         elif self._taught is not None:
             route = self._taught.route
@@ -279,12 +279,12 @@ class NavigationStage:
             raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
         self._taught = TaughtRoute(route, command.id)
 
-    def _keyframe(self, id: int) -> KeyframePose | None:
-        """Return a keyframe of the map, None without one."""
-        T_map_rect = self.keyframes.T_map_rect.get(id)
-        if T_map_rect is None:
-            return None
-        return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rect @ T_map_rect @ self._T_rect_base))
+    def _keyframe_poses(self) -> dict[int, KeyframePose]:
+        """Return the keyframes of the map by id, with the poses of the base at them."""
+        return {
+            id: KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rect @ T_map_rect @ self._T_rect_base))
+            for id, T_map_rect in self.keyframes.T_map_rect.items()
+        }
 
     def _require_map(self, *, teaches: bool = False) -> None:
         """Raise OmnidError where no route can be tied to a map. teaches: a route may be taught now."""
@@ -313,10 +313,10 @@ class NavigationStage:
         plan, self._plan = self._plan, None
         teaching = recorder.name if recorder else ""
         state = (now.state, now.reason, navigator.task, teaching, self._taught, answer)
-        same = state == self._given and now.setpoint is None and plan is None
-        if same and not always and stamp_ns - self._given_ns < REPEAT_NS:
+        same = state == self._published and now.setpoint is None and plan is None
+        if same and not always and stamp_ns - self._published_ns < REPEAT_NS:
             return None
-        self._given, self._given_ns = state, stamp_ns
+        self._published, self._published_ns = state, stamp_ns
         drive = navigator.drive
         return NavigationUpdate(
             self._seq,

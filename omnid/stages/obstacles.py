@@ -1,4 +1,4 @@
-"""Obstacles of a run: the floor, the grid around the base at each pair, and the scan that is given out."""
+"""Obstacles of a run: the floor, the grid around the base at each pair, and the scan that is published."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FLOOR_WARNING: Final = (
 
 
 class CameraFloor:
-    """The floor below the cameras; each stage has its own, fed with the depths that it uses: threads change nothing."""
+    """The floor below the cameras; each stage has its own, independent of the order of threads."""
 
     def __init__(self, rig: Rig, floor_m: float) -> None:
         """floor_m: height of the floor in the base frame (obstacles.scan.floor_m)."""
@@ -97,7 +97,7 @@ class Obstacles:
         self._geometry, self._dense = geometry, dense
         self._period_ns = NS_PER_S / config.rate_hz if config.rate_hz else 0.0
         self.floor = CameraFloor(geometry.rig, config.scan.floor_m)
-        self._of_floor: Floor | None = None  # for which the tables of the scans were made
+        self._tables_floor: Floor | None = None  # floor for which the tables of the scans were made
         self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, config.scan)
         self._tracker = MovingTracker()
         self._T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
@@ -121,25 +121,25 @@ class Obstacles:
 
     def scan(self, odometry: OdometryUpdate) -> ObstacleScan:
         """Add the evidence of a pair; return the scan at it, which is unknown while the floor or the pose is."""
-        # 1. Forget the grid and the tracks where odometry has begun again; while it is lost the grid stays: it holds
-        #    again once odometry recognises its landmarks.
+        # 1. Forget the grid and the tracks where odometry has begun again; while it is lost the grid is kept: it is
+        #    valid again once odometry recognises its landmarks.
         is_lost = odometry.state is TrackingState.LOST
-        if is_again := odometry.reset_counter != self._resets:
+        if has_reset := odometry.reset_counter != self._resets:
             self.scans.begin_again()
             self._resets = odometry.reset_counter
-        if is_again or is_lost:
+        if has_reset or is_lost:
             self._tracker = MovingTracker()
         panoramas = odometry.depth.panoramas
         T_odom_base = frames.of_base(odometry, self._geometry.rig.T_base_rig)[0]
-        tiles, of_base = panoramas.tiles, (self._geometry.cylinder, self._T_base_rect)
-        unwatched = sectors_of(tiles.unknown, *of_base, self._ranges_m)
+        tiles, cylinder = panoramas.tiles, self._geometry.cylinder
+        unwatched = sectors_of(tiles.unknown, cylinder, self._T_base_rect, self._ranges_m)
         unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         # 2. Tables of the floor.
         floor = self.floor.floor
         if is_lost or floor is None:
             return unknown
-        if floor is not self._of_floor:
-            self._of_floor = floor
+        if floor is not self._tables_floor:
+            self._tables_floor = floor
             T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(self.floor.T_floor_rig(floor))
             self.scans.set_floor(T_rect_floor, panoramas.visible)
         # 3. The scan by the images, without their dead and blind parts.
@@ -148,10 +148,11 @@ class Obstacles:
         if scan is None:
             return unknown
         # 4. The moving obstacles.
-        scan.arrivals.ranges_m[sectors_of(tiles.unknown, *of_base, (math.inf,))] = np.nan
+        is_unknown = sectors_of(tiles.unknown, cylinder, self._T_base_rect, (math.inf,))
+        scan.arrivals.ranges_m[is_unknown] = np.nan
         viewpoint = transform(self.scans.grid.viewpoint(planar(T_odom_base)))
         moving = self._tracker.update(odometry.stamp_ns, viewpoint, scan.arrivals)
-        # 5. Nothing is said of directions in which the images show nothing to rely on.
+        # 5. Directions in which the images show nothing to rely on are unknown.
         return replace(
             unknown,
             ranges_m=np.where(unwatched, UNKNOWN, scan.ranges_m),

@@ -116,7 +116,7 @@ def navigation_verb(text: str) -> NavigationVerb:
     """Return the verb of a text. Raise OmnidError for any other text."""
     word = text.strip() if len(text) <= LONGEST_TEXT else ""
     if word not in list(NavigationVerb):
-        raise OmnidError(f"{_shown(text)} is no request to the navigation: expected {', '.join(NavigationVerb)}")
+        raise OmnidError(f"{_quoted(text)} is no request to the navigation: expected {', '.join(NavigationVerb)}")
     return NavigationVerb(word)
 
 
@@ -124,7 +124,7 @@ def route_name(text: str) -> str:
     """Return the name of a route, which can be part of a file name. Raise OmnidError for a text that cannot."""
     if not _NAME.fullmatch(text):
         raise OmnidError(
-            f"{_shown(text)} is no name of a route: expected letters, digits, '-' and '_', a letter or "
+            f"{_quoted(text)} is no name of a route: expected letters, digits, '-' and '_', a letter or "
             f"digit first, at most {LONGEST_NAME}"
         )
     return text
@@ -139,20 +139,20 @@ def route_request(text: str) -> RouteRequest:
         case ["teach", name, *options] if options in ([], ["replace"]):
             return RouteRequest(RouteAction.TEACH, route_name(name), replace=bool(options))
         case ["repeat", name, *options] if len(options) == len({option.partition("=")[0] for option in options}):
-            return _repeat(route_name(name), options, text)
-    raise OmnidError(f"{_shown(text)} is no request about routes: expected {ROUTE_USAGE}")
+            return _repeat_request(route_name(name), options, text)
+    raise OmnidError(f"{_quoted(text)} is no request about routes: expected {ROUTE_USAGE}")
 
 
-def _repeat(name: str, options: list[str], text: str) -> RouteRequest:
+def _repeat_request(name: str, options: list[str], text: str) -> RouteRequest:
     loops = 1
     for option in options:
         found = _LOOPS.fullmatch(option)
         if found and int(found[1]) <= MAX_LOOPS:
             loops = int(found[1])
         elif option not in ("reverse", "from=here", "from=start"):
-            raise OmnidError(f"{_shown(text)}: expected {ROUTE_USAGE}, N at most {MAX_LOOPS}")
+            raise OmnidError(f"{_quoted(text)}: expected {ROUTE_USAGE}, N at most {MAX_LOOPS}")
     return RouteRequest(RouteAction.REPEAT, name, "reverse" in options, loops, "from=start" in options)
 
 
-def _shown(text: str) -> str:
+def _quoted(text: str) -> str:
     return ascii(text[:60])

@@ -6,7 +6,7 @@ A route is tied to keyframes of the map: where an optimisation of the map moves 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative, wrapped
 from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path
-from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
@@ -30,10 +29,9 @@ SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be 
 CLOSED_M: Final = 1.0  # Most distance between the ends of a route that is driven in rounds.
 ENTRY_M: Final = 1.5  # Most distance of the robot from a route that it repeats.
 ENTRY_M_PER_RAD: Final = 0.5  # Cost of a radian of heading error where several pieces of a route are near.
-BESIDE_M: Final = 0.25  # A robot farther from the route drives to a point ahead on it.
+BESIDE_M: Final = 0.25  # A robot that is farther from the route drives to a point ahead on it.
 JOIN: Final = 2.5  # Way along the route to that point by lateral distance: at 22 degrees, which is no corner.
 DECIMALS: Final = 6  # Decimals of a route, as in its file, so that reading it changes nothing.
-FarKeyframe = Callable[[int], "KeyframePose | None"]
 
 
 class KeyframePose(NamedTuple):
@@ -66,19 +64,19 @@ class Route:
         """True if the route ends at its start: then it is driven in rounds."""
         return math.dist(self.poses[0, :2], self.poses[-1, :2]) <= CLOSED_M
 
-    def fits(self, keyframe: FarKeyframe) -> bool:
-        """True if a map holds the keyframes that were noted, by their stamps."""
-        found = sum((now := keyframe(id)) is not None and now.stamp_ns == stamp for id, stamp in self.stamps_ns.items())
+    def fits(self, keyframes: Mapping[int, KeyframePose]) -> bool:
+        """True if a map, of keyframes by id, holds enough of those in stamps_ns."""
+        found = sum(id in keyframes and keyframes[id].stamp_ns == stamp for id, stamp in self.stamps_ns.items())
         return found > 0 and found >= SAME_MAP * len(self.stamps_ns)
 
-    def in_map(self, keyframe: FarKeyframe) -> Array:
-        """Return the poses (N, 3) in the map of now; those of dropped keyframes move with their neighbours."""
+    def in_map(self, keyframes: Mapping[int, KeyframePose]) -> Array:
+        """Return the poses (N, 3) in the present map; those of dropped keyframes move with their neighbours."""
         moved = np.full((len(self.poses), 3), np.nan)
-        for id in np.unique(self.keyframes):
-            now = keyframe(int(id)) if id != NO_KEYFRAME else None
-            if now is not None and now.stamp_ns == self.stamps_ns.get(int(id)):
+        for id in np.unique(self.keyframes).tolist():
+            keyframe = keyframes.get(id)
+            if keyframe is not None and keyframe.stamp_ns == self.stamps_ns.get(id):
                 at = self.keyframes == id
-                moved[at] = composed(np.repeat(now.pose[None], at.sum(), 0), self.in_keyframe[at])
+                moved[at] = composed(np.repeat(keyframe.pose[None], at.sum(), 0), self.in_keyframe[at])
         known = np.isfinite(moved[:, 0])
         if not known.any():
             return self.poses
@@ -101,23 +99,32 @@ class Route:
         )
 
 
+class RoutePoint(NamedTuple):
+    """A point of a recording."""
+
+    pose: Array  # x, y, yaw (3,) of the base in the map
+    speed_mps: float
+    keyframe: int  # id
+    in_keyframe: Array  # (3,) pose in the keyframe
+
+
 class RouteRecorder:
     """Collects the points of a route while it is driven."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.length_m = 0.0
-        self._points: list[tuple[Array, float, int, Array]] = []
-        self._newest: tuple[Array, int, Array] | None = None  # pose, keyframe, pose in it: where the recording ends
+        self._points: list[RoutePoint] = []
+        self._newest: RoutePoint | None = None  # the end of the recording
 
     def add(self, pose: Array, speed_mps: float, keyframe: int, keyframe_pose: Array) -> None:
         """Add a pose (3,) of the base in the map where it has moved; keyframe_pose (3,): of its keyframe.
 
         Raise OmnidError for a route that gets too long.
         """
-        self._newest = pose, keyframe, relative(keyframe_pose, pose)
+        self._newest = point = RoutePoint(pose, speed_mps, keyframe, relative(keyframe_pose, pose))
         if self._points:
-            step = relative(self._points[-1][0], pose)
+            step = relative(self._points[-1].pose, pose)
             moved_m = math.hypot(step[0], step[1])
             if moved_m < SPACING_M and abs(float(wrapped(step[2]))) < SPACING_RAD:
                 return
@@ -125,11 +132,11 @@ class RouteRecorder:
         if len(self._points) >= MOST_POINTS or self.length_m > MAX_LENGTH_M:
             raise OmnidError(f"the route {self.name} is too long: {len(self._points)} points, {self.length_m:.0f} m")
         if abs(speed_mps) < STANDING_MPS and self._points:
-            speed_mps = math.copysign(STANDING_MPS, self._points[-1][1])
-        self._points.append((pose, speed_mps, keyframe, relative(keyframe_pose, pose)))
+            point = point._replace(speed_mps=math.copysign(STANDING_MPS, self._points[-1].speed_mps))
+        self._points.append(point)
 
-    def route(self, keyframe: FarKeyframe, noted: Mapping[int, int], created_s: int, map_name: str) -> Route:
-        """Return the route in the map as it is now; noted: stamps of keyframes that identify the map.
+    def route(self, keyframes: Mapping[int, KeyframePose], created_s: int, map_name: str) -> Route:
+        """Return the route in the present map, of keyframes by id.
 
         Raise OmnidError for one that is too short.
         """
@@ -138,51 +145,51 @@ class RouteRecorder:
                 f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
                 "and more: drive it, then finish; `omnid route stop` drops it"
             )
-        poses, speeds, keyframes, in_keyframe = zip(*self._to_its_end(), strict=True)
-        stamps = dict(noted)
-        for id in set(keyframes):
-            found = keyframe(id) if id != NO_KEYFRAME else None
-            if found is not None:
-                stamps[id] = found.stamp_ns
+        poses, speeds, ids, in_keyframe = zip(*self._points_to_end(), strict=True)
         route = Route(
             self.name,
             np.array(poses),
             np.array(speeds).round(DECIMALS),
-            np.array(keyframes, np.int64),
+            np.array(ids, np.int64),
             np.array(in_keyframe),
-            stamps,
+            {id: keyframe.stamp_ns for id, keyframe in keyframes.items()},
             created_s,
             map_name,
         )
         return replace(
-            route, poses=route.in_map(keyframe).round(DECIMALS), in_keyframe=route.in_keyframe.round(DECIMALS)
+            route, poses=route.in_map(keyframes).round(DECIMALS), in_keyframe=route.in_keyframe.round(DECIMALS)
         )
 
-    def _to_its_end(self) -> list[tuple[Array, float, int, Array]]:
-        """Return the points; the last one is where the recording ends, however near to that before it."""
+    def _points_to_end(self) -> list[RoutePoint]:
+        """Return the points; the last one is the end of the recording, however near to the point before it."""
         if self._newest is None:
             return self._points
-        last, speed_mps, *_ = self._points[-1]
-        pose, keyframe, in_keyframe = self._newest
-        step = relative(last, pose)
+        last, newest = self._points[-1], self._newest
+        step = relative(last.pose, newest.pose)
         if math.hypot(step[0], step[1]) <= 0.5 * SPACING_M or len(self._points) >= MOST_POINTS:
-            return [*self._points[:-1], (pose, speed_mps, keyframe, in_keyframe)]
-        return [*self._points, (pose, math.copysign(speed_mps, step[0]), keyframe, in_keyframe)]
+            return [*self._points[:-1], newest._replace(speed_mps=last.speed_mps)]
+        return [*self._points, newest._replace(speed_mps=math.copysign(last.speed_mps, step[0]))]
 
 
 def repeated_paths(
-    route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool, from_start: bool = False
+    route: Route,
+    keyframes: Mapping[int, KeyframePose],
+    pose: Array,
+    *,
+    loops: int,
+    reverse: bool,
+    from_start: bool = False,
 ) -> list[DrivePath]:
     """Return the paths that repeat a route from the nearest point on it to a pose (3,) of the base in the map.
 
     A closed route is driven in rounds, any other there and back, `loops` times in all. from_start: the whole route.
-    Raise OmnidError where the robot is not near it, or not near its start, or at the end of the only way.
+    Raise OmnidError where the robot is not near the route or its start, or at the end of a route that is driven once.
     """
-    there = route.reversed() if reverse else route
-    poses = there.in_map(keyframe)
-    # 1. Where on it the robot begins: at the start, or at the nearest point by place and heading.
+    directed = route.reversed() if reverse else route
+    poses = directed.in_map(keyframes)
+    # 1. The point of entry: the start, or the nearest point by position and heading.
     away_m = np.hypot(*(poses[:, :2] - pose[:2]).T)
-    least_m, first = (away_m[0], 0) if from_start else (away_m.min(), _nearest(there, poses, pose, away_m))
+    least_m, first = (away_m[0], 0) if from_start else (away_m.min(), _nearest(directed, poses, pose, away_m))
     if least_m > ENTRY_M:
         where = "the start of the route" if from_start else "the route"
         to = "or begin where it is on the route (from=here)" if from_start else "anywhere on it"
@@ -192,21 +199,21 @@ def repeated_paths(
     ways_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0).T)))
     if loops == 1 and ways_m[-1] <= BESIDE_M:
         raise OmnidError("the robot is at the end of the route: repeat it in reverse, or drive to its start first")
-    # 2. Off the route it joins it farther on, before the next corner.
+    # 2. A robot beside the route joins it farther on, before the next corner.
     is_beside = away_m[first] > BESIDE_M
     if is_beside and not from_start:
         goes_on = (
             (ways_m <= JOIN * away_m[first])
             & (np.abs(wrapped(poses[first:, 2] - poses[first, 2])) < CORNER_RAD)
-            & (there.speeds[first:] * there.speeds[first] > 0)
+            & (directed.speeds[first:] * directed.speeds[first] > 0)
         )
         goes_on[0] = True
         first += int(np.argmin(np.append(goes_on, False))) - 1
     # 3. The rest of the round, and the others.
-    paths = [_path(there, poses, first, pose if is_beside else None)]
+    paths = [_path(directed, poses, first, pose if is_beside else None)]
     if loops > 1:
-        rounds = [there] if route.is_closed else [there, there.reversed()]
-        ways = [_path(each, each.in_map(keyframe), 0) for each in rounds]
+        rounds = [directed] if route.is_closed else [directed, directed.reversed()]
+        ways = [_path(each, each.in_map(keyframes), 0) for each in rounds]
         paths += [ways[k % len(ways)] for k in range(1, loops)]
     return paths
 

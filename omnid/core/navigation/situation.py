@@ -15,7 +15,7 @@ from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
-# A larger sigma says that the pose in the map is not known at all, because it is a kilometre then.
+# A larger sigma means that the pose in the map is unknown: it is a kilometre then.
 UNKNOWN_M: Final = 100.0
 
 
@@ -47,7 +47,7 @@ class MapPosition(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """The newest pose, and what else decides about motion."""
+    """The newest pose, and the other inputs that decide about motion."""
 
     stamp_ns: int
     pose: Array  # x, y, yaw (3,) of the base in odom
@@ -57,7 +57,7 @@ class Situation(NamedTuple):
     resets: int  # how often odometry has begun again
     wheels: WheelState
     in_map: MapPosition | None = None  # None: nothing is known yet
-    around: Surroundings | None = None  # what is about the base; None: nothing is known of it now
+    around: Surroundings | None = None  # surroundings of the base; None: unknown
 
     def T_frame_odom(self, frame: NavigationFrame) -> Array:
         """Return the pose of odom in a frame (3,)."""

@@ -277,23 +277,23 @@ def stick() -> Stick:
 
 
 def test_a_motion_lasts_as_long_as_its_key_is_repeated_at_a_share_of_the_limits(stick: Stick) -> None:
-    assert stick.twist(0.0) == (0.0, 0.0) and not stick.commands(0.0)
+    assert stick.twist(0.0) == (0.0, 0.0) and not stick.is_moving(0.0)
     stick.press(UP, 10.0)
     assert stick.twist(10.0 + HOLD_S) == (0.5, 0.0)
     assert stick.twist(10.01 + HOLD_S) == (0.0, 0.0)
-    assert stick.commands(10.0 + 2 * HOLD_S) and not stick.commands(10.01 + 2 * HOLD_S)
+    assert stick.is_moving(10.0 + 2 * HOLD_S) and not stick.is_moving(10.01 + 2 * HOLD_S)
     stick.press(b"+" * 50 + UP, 20.0)
     assert stick.twist(20.0) == (1.0, 0.0)
     stick.press(b"-" * 50, 20.0)
     assert 0.0 < stick.twist(20.0)[0] <= 0.1
     stick.press(UP + b"a q", -math.inf)  # typed while it connected: motions are over
-    assert stick.arm_asked and stick.stop_asked and stick.quit and not stick.commands(0.0)
+    assert stick.arm_asked and stick.stop_asked and stick.quit and not stick.is_moving(0.0)
 
 
 @pytest.mark.parametrize("key", [b" ", b"x", b"\x1b[1;2A"])
 def test_any_other_key_ends_the_motion_and_means_nothing_else(stick: Stick, key: bytes) -> None:
     stick.press(UP + key, 0.0)
-    assert stick.twist(0.0) == (0.0, 0.0) and stick.commands(0.0)
+    assert stick.twist(0.0) == (0.0, 0.0) and stick.is_moving(0.0)
     assert stick.stop_asked == (key == b" ") and not (stick.arm_asked or stick.quit) and stick.share == 0.5
     stick.press(b" ", 0.1)
     assert stick.stop_asked, "also after the first part of a key"

@@ -49,8 +49,9 @@ class Map:
         self.poses = {k: pose for k, pose in enumerate(poses[:: round(SPACING_M / 0.02)])}
         self.stamps = {k: 1000 + 7 * k for k in self.poses}
 
-    def __call__(self, id: int) -> KeyframePose | None:
-        return KeyframePose(self.stamps[id], self.poses[id]) if id in self.poses else None
+    @property
+    def keyframes(self) -> dict[int, KeyframePose]:
+        return {id: KeyframePose(self.stamps[id], pose) for id, pose in self.poses.items()}
 
     def nearest(self, pose: Array) -> int:
         return min(self.poses, key=lambda k: math.dist(self.poses[k][:2], pose[:2]))
@@ -65,7 +66,7 @@ def taught(poses: Array, places: Map, speed_mps: float = 0.3) -> Route:
     for pose in poses:
         id = places.nearest(pose)
         recorder.add(pose, speed_mps, id, places.poses[id])
-    return recorder.route(places, places.stamps, 1_700_000_000, "site.omap")
+    return recorder.route(places.keyframes, 1_700_000_000, "site.omap")
 
 
 def bent(pose: Array) -> Array:
@@ -79,7 +80,7 @@ def test_a_route_ends_where_the_robot_stood_when_it_was_finished(last: int) -> N
     standing = np.repeat(poses[-1:], 5, axis=0) + np.array([0.0, 0.0, math.radians(4)])
     route = taught(np.vstack([poses, standing]), places := Map(poses))
     np.testing.assert_allclose(route.poses[-1], standing[-1], atol=1e-6)
-    (path,) = repeated_paths(route, places, poses[0], loops=1, reverse=False)
+    (path,) = repeated_paths(route, places.keyframes, poses[0], loops=1, reverse=False)
     assert len(path.legs) == 1 and not path.legs[0].backwards
     np.testing.assert_allclose(path.goal, poses[-1, :2], atol=1e-6)
     assert path.legs[0].speed.min() == pytest.approx(0.3), "the last step is driven as the others"
@@ -89,15 +90,15 @@ def test_a_route_moves_with_the_keyframes_of_its_map() -> None:
     poses = way()
     places = Map(poses)
     route = taught(poses, places)
-    np.testing.assert_allclose(route.in_map(places), route.poses, atol=2e-6)
+    np.testing.assert_allclose(route.in_map(places.keyframes), route.poses, atol=2e-6)
     places.move(bent)
-    moved = route.in_map(places)
+    moved = route.in_map(places.keyframes)
     expected = np.array([bent(pose) for pose in route.poses])
     assert np.abs(moved - expected)[:, :2].max() < 0.06, "a metre behind the last keyframe, the map is still bent"
     assert np.abs(moved - route.poses)[-1, 1] > 0.4, "it has moved by much"
     for id in (3, 4, 5):
         del places.poses[id]
-    assert np.abs(route.in_map(places) - expected)[:, :2].max() < 0.08, "neighbours stand in for what is gone"
+    assert np.abs(route.in_map(places.keyframes) - expected)[:, :2].max() < 0.08, "neighbours stand in for what is gone"
 
 
 @pytest.mark.hazard("H29")
@@ -105,16 +106,16 @@ def test_a_keyframe_of_another_map_does_not_count() -> None:
     poses = way()
     places = Map(poses)
     route = taught(poses, places)
-    assert route.fits(places)
+    assert route.fits(places.keyframes)
     other = Map(poses)
     other.stamps = {k: stamp + 1 for k, stamp in other.stamps.items()}
     other.move(bent)
-    assert not route.fits(other)
-    np.testing.assert_allclose(route.in_map(other), route.poses)
-    assert not replace(route, stamps_ns={}).fits(places)
+    assert not route.fits(other.keyframes)
+    np.testing.assert_allclose(route.in_map(other.keyframes), route.poses)
+    assert not replace(route, stamps_ns={}).fits(places.keyframes)
     some = Map(poses)
     some.poses = {k: pose for k, pose in some.poses.items() if k % 2}
-    assert route.fits(some), "an aged map is still the same"
+    assert route.fits(some.keyframes), "an aged map is still the same"
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.2, 0.0), (4.0, 2.0, 0.3), (0.3, -0.6, 2.0)])
@@ -123,7 +124,7 @@ def test_is_repeated_from_anywhere_on_it(start: tuple[float, float, float]) -> N
     places = Map(poses)
     route = taught(poses, places)
     base = DrivenBase(Navigator(NavigationSettings()), 3, start=start)
-    paths = repeated_paths(route, places, base.pose, loops=1, reverse=False)
+    paths = repeated_paths(route, places.keyframes, base.pose, loops=1, reverse=False)
     base.navigator.start("route hall", NavigationFrame.MAP, paths, base.seen())
     assert base.run(120).state is NavigationState.REACHED
     away_m, turned_rad = base.error(tuple(route.poses[-1]))
@@ -138,11 +139,11 @@ def test_a_robot_beside_the_route_joins_it_ahead_without_a_corner_and_not_past_o
     corner = straight[-1] + np.column_stack([np.zeros(100), np.arange(0.02, 2.02, 0.02), np.full(100, math.pi / 2)])
     route = taught(np.vstack([straight, corner]), places := Map(straight))
     for y_m in (0.8, -0.8):
-        (path,) = repeated_paths(route, places, np.array([2.0, y_m, 0.0]), loops=1, reverse=False)
+        (path,) = repeated_paths(route, places.keyframes, np.array([2.0, y_m, 0.0]), loops=1, reverse=False)
         assert len(path.legs) == 2, "no corner but that of the route"
         on_route = path.legs[0].xy[np.abs(path.legs[0].xy[:, 1]) < 0.01]
         assert on_route[0, 0] == pytest.approx(2.0 + 2.5 * 0.8, abs=0.2)
-    (path,) = repeated_paths(route, places, np.array([5.6, 0.9, 0.0]), loops=1, reverse=False)
+    (path,) = repeated_paths(route, places.keyframes, np.array([5.6, 0.9, 0.0]), loops=1, reverse=False)
     assert any(math.dist(xy, (6.0, 0.0)) < 0.15 for leg in path.legs for xy in leg.xy), "its corner is not cut"
 
 
@@ -150,13 +151,13 @@ def test_the_whole_route_is_driven_from_its_start_only() -> None:
     poses = way()
     route, places = taught(poses, Map(poses)), Map(poses)
     near, far = np.array([0.2, 0.4, 0.0]), poses[200]
-    (path,) = repeated_paths(route, places, near, loops=1, reverse=False, from_start=True)
+    (path,) = repeated_paths(route, places.keyframes, near, loops=1, reverse=False, from_start=True)
     assert path.length_m > route.length_m and np.hypot(*(path.legs[0].xy - poses[0, :2]).T).min() < 0.1
     with pytest.raises(OmnidError, match=r"3\.\d m away from the start of the route: .*from=here"):
-        repeated_paths(route, places, far, loops=1, reverse=False, from_start=True)
-    repeated_paths(route, places, poses[-10], loops=1, reverse=True, from_start=True)
+        repeated_paths(route, places.keyframes, far, loops=1, reverse=False, from_start=True)
+    repeated_paths(route, places.keyframes, poses[-10], loops=1, reverse=True, from_start=True)
     with pytest.raises(OmnidError, match="the robot is at the end of the route: repeat it in reverse"):
-        repeated_paths(route, places, poses[-1], loops=1, reverse=False)
+        repeated_paths(route, places.keyframes, poses[-1], loops=1, reverse=False)
 
 
 def test_is_driven_back_and_there_again_and_in_rounds() -> None:
@@ -164,7 +165,7 @@ def test_is_driven_back_and_there_again_and_in_rounds() -> None:
     places = Map(poses)
     route = taught(poses, places)
     base = DrivenBase(Navigator(NavigationSettings()), 4)
-    paths = repeated_paths(route, places, base.pose, loops=2, reverse=False)
+    paths = repeated_paths(route, places.keyframes, base.pose, loops=2, reverse=False)
     base.navigator.start("route hall", NavigationFrame.MAP, paths, base.seen())
     assert base.run(120).state is NavigationState.REACHED
     assert math.dist(base.pose[:2], route.poses[0, :2]) < 0.03, "there and back"
@@ -189,8 +190,8 @@ def test_a_piece_that_was_driven_backwards_is_repeated_so() -> None:
     recorder, places = RouteRecorder("dock"), Map(ahead)
     for pose, speed in [*((pose, 0.3) for pose in ahead), *((pose, -0.2) for pose in ahead[:40:-1])]:
         recorder.add(pose, speed, 0, places.poses[0])
-    route = recorder.route(places, places.stamps, 0, "m")
-    (path,) = repeated_paths(route, places, np.zeros(3), loops=1, reverse=False)
+    route = recorder.route(places.keyframes, 0, "m")
+    (path,) = repeated_paths(route, places.keyframes, np.zeros(3), loops=1, reverse=False)
     assert [leg.backwards for leg in path.legs] == [False, True]
 
 
