@@ -22,7 +22,7 @@ from omnid.commands import options
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
 from omnid.diagnostics.status import show_progress, summary_entries, timing_table
-from omnid.engine.graph import nothing
+from omnid.engine.graph import no_op
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
@@ -243,7 +243,7 @@ def _drive(args: argparse.Namespace) -> int:
     config = options.settings_of(args, {"places.map": place_map, "navigation.routes": routes})
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
     prepare_kernels()  # which says so where it takes long
-    show = nothing if args.quiet else partial(print, flush=True)
+    show = no_op if args.quiet else partial(print, flush=True)
     show("a simulated robot is taught an oval and repeats it, in its own\ntime: a minute or two")
     is_reached, lines = demonstrate(image, config, args.seed, show)
     print(*lines, f"written   {image}, {place_map}", sep="\n")

@@ -133,7 +133,8 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         session = Session(config, graph, outputs, warn, clock)
         # 1. The rig, and what is compiled or imported before the first image.
         geometry = session.geometry(rig or read_rig(Path(config.cameras.rig)), ())
-        compile_serialisers([topic.schema for topic in (*topics.PUBLISHED.values(), *topics.COMMANDS.values())])
+        published = (topic.schema for topic in topics.PUBLISHED.values())
+        compile_serialisers([*published, *(command.schema for command in topics.COMMANDS.values())])
         prepare_kernels()
         import_module("scipy.sparse.linalg")  # needed by the first loop closure
         outputs.enter_context(graph.signals())

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
-from omnid.engine.graph import Graph, nothing
+from omnid.engine.graph import Graph, no_op
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
@@ -101,7 +101,7 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
             maps={"map": lambda update: write_ply(cloud, update.points)},
         )
         read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
-        wire(config, Inputs([read], RunPlaces(config, place, nothing)), FrontEnd(place, config), graph, outputs)
+        wire(config, Inputs([read], RunPlaces(config, place, no_op)), FrontEnd(place, config), graph, outputs)
         graph.run()
     found = {label: 1e-6 * spent_ns / (pairs - SKIPPED) for label, spent_ns in clock.stage_ns.items()}
     found["all stages"] = sum(found.values())

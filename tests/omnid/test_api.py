@@ -196,7 +196,7 @@ def example(name: str, *words: object, cwd: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, check=True).stdout
 
 
-def test_example_of_a_replay(tmp_path: Path, scene: Path, result: omnid.RunResult) -> None:
+def test_the_example_of_a_replay_runs(tmp_path: Path, scene: Path, result: omnid.RunResult) -> None:
     out = example("replay_log", scene / "log.mcap", scene / "rig.toml", cwd=tmp_path)
     assert out.startswith(f"{PAIRS} poses, {result.counters.length_m:.2f} m")
     result.save_tum(tmp_path / "expected.tum")
@@ -204,7 +204,7 @@ def test_example_of_a_replay(tmp_path: Path, scene: Path, result: omnid.RunResul
     assert (tmp_path / "map.ply").stat().st_size > 1000
 
 
-def test_example_of_images(tmp_path: Path, scene: Path, pairs: list[Pair], result: omnid.RunResult) -> None:
+def test_the_example_of_images_runs(tmp_path: Path, scene: Path, pairs: list[Pair], result: omnid.RunResult) -> None:
     for name, index in (("lower", 1), ("upper", 2)):
         (tmp_path / name).mkdir()
         for pair in pairs[:5]:
@@ -214,7 +214,7 @@ def test_example_of_images(tmp_path: Path, scene: Path, pairs: list[Pair], resul
     assert len(lines) == 5 and f"tracking ({x_m:.3f}, {y_m:.3f}) m" in lines[4]
 
 
-def test_example_of_the_geometry(tmp_path: Path, scene: Path, pairs: list[Pair]) -> None:
+def test_the_example_of_the_geometry_runs(tmp_path: Path, scene: Path, pairs: list[Pair]) -> None:
     write_rig(tmp_path / "rig.toml", read_rig(scene / "rig.toml"))
     cv2.imwrite(str(tmp_path / "lower.png"), pairs[0][1])
     out = example("rectify_image", "rig.toml", "lower.png", "panorama.png", cwd=tmp_path)
@@ -232,7 +232,7 @@ def robot() -> Iterator[tuple[Bus, str]]:
         yield bus, endpoint
 
 
-def test_imports_nothing_that_only_the_daemon_needs() -> None:
+def test_the_client_imports_nothing_that_only_the_daemon_needs() -> None:
     words = [sys.executable, "-c", "import omnid.client, sys; print(*sys.modules)"]
     modules = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
     assert not {"cv2", "serial", "filterpy", "mcap", "scipy"} & set(modules) and "zenoh" in modules

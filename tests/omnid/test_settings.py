@@ -92,7 +92,7 @@ def test_an_override_needs_no_quotes(override: str, value: str) -> None:
         (b"robot = '\xff'", "expected TOML in UTF-8, found another byte at offset 9"),
     ],
 )
-def test_refuses_what_is_not_as_declared(text: str | bytes, expected: str) -> None:
+def test_values_that_are_not_as_declared_are_refused(text: str | bytes, expected: str) -> None:
     message = refusal(text)
     assert message.startswith("omnid.toml: ") and expected in message
 
@@ -106,12 +106,12 @@ def test_refuses_what_is_not_as_declared(text: str | bytes, expected: str) -> No
         ("robot=a\udcff", "robot: expected UTF-8, found 'a\\udcff'"),
     ],
 )
-def test_refuses_a_wrong_override(override: str, expected: str) -> None:
+def test_a_wrong_override_is_refused(override: str, expected: str) -> None:
     message = refusal("", override)
     assert message.startswith("override ") and expected in message
 
 
-def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_an_error_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     for path in (tmp_path / "missing.toml", tmp_path, Path("a\0b"), written(tmp_path, b"#" * (MAX_FILE_BYTES + 1))):
         with pytest.raises(OmnidError, match=r"settings file .*(omnid|missing|test_|a\\x00b)"):
             load(Sample, path)
@@ -171,7 +171,7 @@ def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
         ("replay", "cameras.width_px=640"),
     ],
 )
-def test_refuses_an_override_that_the_command_ignores(command: str, override: str) -> None:
+def test_an_override_that_the_command_ignores_is_refused(command: str, override: str) -> None:
     config = load_config(None, [override])
     with pytest.raises(OmnidError, match=rf"^override '.*': `omnid {command}` does not use \S+: leave it out$"):
         unused_settings(config, command, [override])

@@ -24,7 +24,7 @@ from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.status import RunStatistics
-from omnid.engine.graph import Graph, nothing
+from omnid.engine.graph import Graph, no_op
 from omnid.formats.exports import write_ply
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
@@ -318,7 +318,7 @@ def test_memory_stays_constant(tmp_path: Path) -> None:
     graph = Graph(threaded=True)
     ends = Outputs(poses=poses, maps={"map": lambda update: write_ply(tmp_path / "map.ply", update.points)})
     read = graph.source("read", lambda: to_and_fro(frames, MANY_PAIRS))
-    wire(config, Inputs([read], RunPlaces(config, place, nothing)), FrontEnd(place, config), graph, ends)
+    wire(config, Inputs([read], RunPlaces(config, place, no_op)), FrontEnd(place, config), graph, ends)
     graph.run()
     print(statistics.states, monitor.mib)
     assert statistics.poses == MANY_PAIRS

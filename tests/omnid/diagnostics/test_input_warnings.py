@@ -19,7 +19,7 @@ from tests.simulation.rigs import with_upper_rotated
 EXCHANGED = ("--lower", UPPER, "--upper", LOWER)
 
 
-def test_refuses_exchanged_cameras(omnid: Command, scene: Path) -> None:
+def test_exchanged_cameras_are_refused(omnid: Command, scene: Path) -> None:
     right = omnid.replay(scene / "log.mcap", rig=scene / "rig.toml")
     assert right.code == 0 and right.err == ""
     for words in ((), ("--inline",)):
@@ -29,7 +29,7 @@ def test_refuses_exchanged_cameras(omnid: Command, scene: Path) -> None:
 
 
 @pytest.mark.hazard("H35")
-def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_rig_that_is_degrees_off_is_refused(omnid: Command, tmp_path: Path, scene: Path) -> None:
     for turn_deg in ((3.0, 0.0, 0.0), (0.0, -3.0, 0.0), (0.0, 0.0, 3.0)):
         write_rig(tmp_path / "rig.toml", with_upper_rotated(read_rig(scene / "rig.toml"), turn_deg))
         err = omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet")
@@ -58,7 +58,7 @@ def test_pairs_of_a_frozen_camera_give_no_pose(
     assert moved_m == pytest.approx(np.linalg.norm(truth.T[19, :3, 3] - truth.T[7, :3, 3]), abs=0.03)
 
 
-def test_warns_of_stamps_that_are_apart(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_stamps_that_are_apart_give_a_warning(omnid: Command, tmp_path: Path, scene: Path) -> None:
     apart_ns = 12_000_000
     taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in images(scene / "log.mcap")]
     log, settings = save(tmp_path / "log.mcap", taken), ("pair.tolerance_ms=10", "log.time='header'")
@@ -68,7 +68,7 @@ def test_warns_of_stamps_that_are_apart(omnid: Command, tmp_path: Path, scene: P
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 
 
-def test_warns_if_the_pose_is_always_lost(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_pose_that_is_always_lost_gives_a_warning(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err

@@ -128,7 +128,7 @@ def daemon(rig: Rig) -> Daemon:
 
 
 @pytest.mark.parametrize(("state", "level"), [("tracking", OK), ("degraded", WARN), ("lost", ERROR)])
-def test_level_follows_the_tracking_state(daemon: Daemon, state: str, level: int) -> None:
+def test_the_level_follows_the_tracking_state(daemon: Daemon, state: str, level: int) -> None:
     daemon.pose(state)
     status = daemon.collected()["odometry"]
     assert (status.level, status.message) == (level, state)
@@ -156,7 +156,7 @@ def test_a_computer_that_is_too_slow_is_named_with_what_to_do(daemon: Daemon) ->
         assert ("too slow" in status.message and status.level == WARN) == (dropped > 10)
 
 
-def test_wheels_driving_stopped_and_faulty(daemon: Daemon) -> None:
+def test_the_status_reports_wheels_that_drive_are_stopped_or_faulty(daemon: Daemon) -> None:
     daemon.pose()
     daemon.tick()
     status = daemon.collected()["wheels"]

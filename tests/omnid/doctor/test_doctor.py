@@ -50,13 +50,13 @@ def robot(tmp_path: Path) -> Robot:
     return Robot(tmp_path)
 
 
-def test_accepts_cameras_that_are_connected(robot: Robot) -> None:
+def test_the_doctor_accepts_cameras_that_are_connected(robot: Robot) -> None:
     first, second = robot.examined()
     assert str(first) == "ok       camera lower  HD Webcam at /dev/video0"
     assert second.level == "ok" and "/dev/video2" in second.found
 
 
-def test_finds_faults_of_cameras(robot: Robot) -> None:
+def test_the_doctor_finds_faults_of_cameras(robot: Robot) -> None:
     (missing, right) = robot.examined(lower="/dev/omnid/lowest")
     assert missing.level == "error" and "/dev/omnid/lowest does not exist" in missing.found
     assert "omnid cameras" in missing.advice and right.level == "ok"
@@ -75,14 +75,14 @@ def port() -> Iterator[str]:
     os.close(controller)
 
 
-def test_checks_the_port_of_the_motor(port: str) -> None:
+def test_the_doctor_checks_the_port_of_the_motor(port: str) -> None:
     settings = MotorSettings(port)
     os.chmod(port, 0o666)
     assert [str(finding) for finding in motor(settings)] == [f"ok       motor         line on {port}"]
     assert motor(MotorSettings("/dev/no-port")).__next__().level == "error"
 
 
-def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
+def test_the_doctor_checks_the_space_for_recordings(tmp_path: Path) -> None:
     (found,) = disk(checks.STATE / "not" / "yet", RecordConfig(keep_mb=360, free_mb=0), 1e5)
     assert found.level == "ok" and f"free at {checks.STATE.parent}" in found.found and "some 1.0 h" in found.found
     for enabled, level in ((False, "warning"), (True, "error")):
@@ -94,7 +94,7 @@ def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
     assert f"\nWorkingDirectory={checks.STATE}\n" in unit and f"\nStateDirectory={checks.STATE.name}\n" in unit
 
 
-def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:
+def test_the_doctor_checks_the_rig(scene: Path, tmp_path: Path) -> None:
     size = read_rig(scene / "rig.toml").lower.camera.size
     *wrong, unknown = rig(scene / "rig.toml", (1280, 960))
     assert [one.level for one in wrong] == ["error", "error"] and "asks for 1280x960" in wrong[0].found
@@ -115,7 +115,7 @@ def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:
         ("tcp/[::]:7447", False),
     ],
 )
-def test_warns_of_open_endpoints_without_rules(endpoint: str, local: bool) -> None:
+def test_the_doctor_warns_of_open_endpoints_without_rules(endpoint: str, local: bool) -> None:
     for config in (BusConfig(listen=(endpoint,)), BusConfig(connect=(endpoint,))):
         found = bus(config)
         assert (found.level == "ok") == local and local != ("bus.config" in found.advice)

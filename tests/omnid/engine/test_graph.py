@@ -182,7 +182,7 @@ def test_ctrl_c_after_a_signal_ends_the_process_at_once() -> None:
     assert subprocess.run(python("-c", STUCK), timeout=LONG_S).returncode == 128 + signal.SIGINT
 
 
-def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
+def test_a_replay_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
     graph, slow = Graph(depth=3), Collect()
     produced: list[int] = []
     ahead: list[int] = []
@@ -204,7 +204,7 @@ def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
     assert [row["drops"] for row in graph.telemetry.summary().values()] == [0, 0, 0]
 
 
-def test_newest_drops_the_oldest_and_counts_it() -> None:
+def test_a_live_inbox_drops_the_oldest_message_and_counts_it() -> None:
     graph, slow, fast, all_sent = Graph(drops=True, depth=2), Collect(), Collect(), threading.Event()
 
     def numbers() -> Iterator[int]:
@@ -251,7 +251,7 @@ def test_stages_of_one_thread_share_it_and_pass_messages_directly() -> None:
     assert {name for name, _ in seen} == {"first", "second", "other"}
 
 
-def test_a_message_from_outside_after_the_end_does_not_take_its_place() -> None:
+def test_a_message_from_outside_after_the_end_is_dropped() -> None:
     graph, sink, has_ended = Graph(drops=True, depth=1), Collect(), threading.Event()
     inlet = graph.inlet(1)
 
@@ -272,7 +272,7 @@ def test_a_message_from_outside_after_the_end_does_not_take_its_place() -> None:
 
 
 @both
-def test_messages_from_outside_are_taken_until_the_sources_end(threaded: bool) -> None:
+def test_messages_from_outside_are_accepted_until_the_sources_end(threaded: bool) -> None:
     graph, sink = Graph(threaded=threaded), Collect()
     inlet = graph.inlet(3)
 

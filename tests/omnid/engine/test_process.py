@@ -57,7 +57,7 @@ LOG = SETUP + (
 )
 
 
-def test_writes_priorities_for_journald(tmp_path: Path) -> None:
+def test_log_lines_have_priorities_for_journald(tmp_path: Path) -> None:
     with (tmp_path / "journal").open("w") as file:
         found = os.fstat(file.fileno())
         environment = os.environ | {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}

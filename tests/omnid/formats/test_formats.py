@@ -47,7 +47,7 @@ def random_poses(count: int) -> np.ndarray:
     return se3.exp(np.random.default_rng(3).normal(size=(count, 6)) * [5, 5, 5, 1.5, 1.5, 1.5])
 
 
-def test_rows_written_are_read_back(tmp_path: Path) -> None:
+def test_written_rows_are_read_back(tmp_path: Path) -> None:
     T = random_poses(200)
     stamps_ns = 1_700_000_000_000_000_001 + 66_666_667 * np.arange(200)
     rows = [tum_row(int(stamp), pose) for stamp, pose in zip(stamps_ns, T, strict=True)]
@@ -69,7 +69,7 @@ def test_stamps_are_exact(tmp_path: Path, word: str, stamp_ns: int) -> None:
     assert read_tum(written(tmp_path, f"{word} 0 0 0 0 0 0 1")).stamps_ns.tolist() == [stamp_ns]
 
 
-def test_accepts_other_layouts(tmp_path: Path) -> None:
+def test_other_layouts_are_accepted(tmp_path: Path) -> None:
     text = "\ufeff# t x y z\r\n\r\n  2.0\t1 2 3   0 0 0 2  # late\r\n#\r\n1.0 4 5 6 0 0 1e8 -1e8 \r\n\n"
     read = read_tum(written(tmp_path, text))
     assert read.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000]
@@ -92,12 +92,12 @@ def test_accepts_other_layouts(tmp_path: Path) -> None:
         ("\x00\x1b[2J", "found 1: '\\x00\\x1b[2J'"),
     ],
 )
-def test_names_the_wrong_line(tmp_path: Path, line: str, found: str) -> None:
+def test_an_error_names_the_wrong_line(tmp_path: Path, line: str, found: str) -> None:
     message = refusal(tmp_path, f"# poses\n{GOOD}{line}\n{GOOD}")
     assert "line 3: expected" in message and found in message
 
 
-def test_repeated_stamp_names_both_lines(tmp_path: Path) -> None:
+def test_a_repeated_stamp_is_refused_with_both_lines(tmp_path: Path) -> None:
     message = refusal(tmp_path, "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n\n2.0 9 0 0 0 0 0 1\n")
     assert "line 4" in message and "line 1" in message
 
@@ -122,7 +122,7 @@ def test_reads_what_was_written(tmp_path: Path, count: int) -> None:
         assert found.dtype == expected.dtype and np.array_equal(found, expected)
 
 
-def test_refuses_paths_that_cannot_be_written(tmp_path: Path) -> None:
+def test_paths_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     for name in ("absent/map.ply", "file/map.ply", "folder", "nul\0.ply", "x" * 300):

@@ -40,7 +40,7 @@ def same(a: object, b: object) -> bool:
 
 
 @pytest.mark.parametrize("count", [0, 1, 25])
-def test_reads_what_was_written_and_writes_the_same_bytes(tmp_path: Path, count: int) -> None:
+def test_a_map_is_read_as_written_and_gives_the_same_bytes(tmp_path: Path, count: int) -> None:
     places = some_places(count)
     write_places(tmp_path / "a.omap", places, RIG)
     read, rig = read_places(tmp_path / "a.omap")

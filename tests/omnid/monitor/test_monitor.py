@@ -78,7 +78,7 @@ def publish_until_it_ends(
     return process.communicate()
 
 
-def test_shows_the_robot_and_ends_with_a_signal() -> None:
+def test_listen_shows_the_robot_and_ends_with_a_signal() -> None:
     endpoint = free_endpoint()
     rover = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
     with rover as bus, listening("--robot", "rover", "--connect", endpoint) as it:
@@ -108,7 +108,7 @@ def received(*numbers: int) -> RobotState:
     return state
 
 
-def test_tells_that_the_daemon_has_ended() -> None:
+def test_listen_reports_that_the_daemon_has_ended() -> None:
     endpoint, state = free_endpoint(), received(1)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
         robot.on_alive(state.set_alive)
@@ -156,7 +156,7 @@ time.sleep(1000)
 
 
 @pytest.mark.hazard("H51")
-def test_a_stop_gets_through_when_all_sessions_are_taken(tmp_path: Path) -> None:
+def test_a_stop_gets_through_when_all_sessions_are_in_use(tmp_path: Path) -> None:
     endpoint, stopped, few = free_endpoint(), [False], tmp_path / "few.json5"
     few.write_text("{transport: {unicast: {max_sessions: 4}}}")
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), config=str(few)))) as bus:

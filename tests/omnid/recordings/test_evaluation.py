@@ -66,7 +66,7 @@ def test_truth_in_another_world_is_no_error() -> None:
     np.testing.assert_allclose(errors, 0.0, atol=1e-7)
 
 
-def test_known_errors() -> None:
+def test_known_errors_are_measured() -> None:
     metrics = evaluate(straight(11, 0.099, heading_rad=-0.02), straight(11, 0.1))
     assert metrics.length_truth_m == pytest.approx(1.0)
     assert metrics.length_error_ratio == pytest.approx(-0.01)

@@ -161,7 +161,7 @@ def test_the_path_in_the_map_is_drawn_beside_that_of_odometry(tmp_path: Path) ->
     assert "in the map" not in Page(html_of(save(tmp_path / "b.mcap", run()))).text
 
 
-def test_compares_with_the_truth_as_eval_does(tmp_path: Path) -> None:
+def test_a_report_compares_with_the_truth_as_eval_does(tmp_path: Path) -> None:
     """The rig is displaced and rotated on its base, and the truth has another world frame."""
     rig = attached_rig_of_sample()
     T_base_rig, T_world_odom = se3.exp([0.3, -0.1, 0.5, 0.1, 0.2, 1.0]), se3.exp([5, -3, 1, 0, 0, 2.0])

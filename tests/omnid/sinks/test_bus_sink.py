@@ -121,7 +121,7 @@ def test_panoramas_are_published_at_the_configured_rate() -> None:
     assert shown.shape == (64, 128) and np.abs(shown.astype(int) - IMAGE[:, 16:-16]).max() < 20
 
 
-def test_who_comes_after_a_drive_gets_its_path() -> None:
+def test_a_late_subscriber_gets_the_path_of_the_drive() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         sink = BusSink(bus, Encoder(se3.transform(np.eye(3), [0.2, 0.0, 1.0]), 10))
@@ -221,7 +221,7 @@ def test_no_pose_of_a_replay_drives_before_its_rig_is_checked(link: Any) -> None
     assert len(link.poses) == len(link.setpoints) == 2
 
 
-def test_setpoints_and_answers_of_the_navigation(link: Any) -> None:
+def test_setpoints_and_answers_of_the_navigation_are_sent(link: Any) -> None:
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
     refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
     assert navigation_answers(update) == {4: Answer(True, "pause: paused: by a request")}

@@ -200,7 +200,7 @@ def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: p
             assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/status"])) == 1
 
 
-def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
+def test_the_recorder_reports_its_state(tmp_path: Path) -> None:
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, clock=set_clock())
     assert (entry(RECORDING, recorder.stats()).level, entry(RECORDING, recorder.stats()).message) == (OK, "recording")

@@ -20,7 +20,7 @@ from drivers.frame import CAMERAS, Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.status import RunStatistics
-from omnid.engine.graph import Graph, nothing
+from omnid.engine.graph import Graph, no_op
 from omnid.formats.tum import read_tum
 from omnid.messages import FramePair, OdometryUpdate
 from omnid.runs.files import RunPlaces
@@ -132,7 +132,7 @@ def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: l
     read = graph.source("read", lambda: frames)
     wire(
         CONFIG,
-        Inputs([read], RunPlaces(CONFIG, place, nothing), map_every_s=0.5),
+        Inputs([read], RunPlaces(CONFIG, place, no_op), map_every_s=0.5),
         FrontEnd(place, CONFIG),
         graph,
         outputs,
@@ -149,7 +149,7 @@ def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: li
         name: graph.source(name, lambda name=name: [frame for frame in frames if frame.camera == name])  # type: ignore[misc]
         for name in CAMERAS
     }
-    inputs = Inputs(list(cameras.values()), RunPlaces(CONFIG, place, nothing))
+    inputs = Inputs(list(cameras.values()), RunPlaces(CONFIG, place, no_op))
     wire(CONFIG, inputs, stages, graph, Outputs(counters={"statistics": statistics}))
     graph.run()
     of = graph.telemetry.of

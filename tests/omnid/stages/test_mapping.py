@@ -99,7 +99,7 @@ def given(stage: MapGrid, updates: list[PlaceUpdate]) -> list[int]:
     return [found.seq for found in map(stage.process, updates) if found is not None]
 
 
-def test_it_is_drawn_when_it_is_due_and_has_changed() -> None:
+def test_a_grid_is_drawn_when_it_is_due_and_has_changed() -> None:
     stage, one, two = MapGrid(0.05, np.eye(4), every_s=2.0), scans(1), scans(2)
     assert given(stage, [grid_update(k, one if k < 7 else two) for k in range(1, 8)]) == [2, 7]
     # Nor scans of unknown place: of a saved map, or after a gap, until a place is recognised.

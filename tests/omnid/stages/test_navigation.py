@@ -151,7 +151,7 @@ class Robot:
         raise AssertionError(self.updates[-1])
 
 
-def test_drives_to_a_goal_of_the_base_in_odom_and_in_the_map(tmp_path: Path) -> None:
+def test_the_base_drives_to_a_goal_in_odom_and_in_the_map(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.pass_on()
     update = robot.send(GoalRequest(ODOM, 1.5, 0.5, 1.0), 77, 5)
@@ -166,7 +166,7 @@ def test_drives_to_a_goal_of_the_base_in_odom_and_in_the_map(tmp_path: Path) -> 
 
 
 @pytest.mark.hazard("H27")
-def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
+def test_a_refusal_names_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
 
     def refusal(request: NavigationRequest) -> str:
@@ -330,7 +330,7 @@ def test_a_full_disk_loses_no_recording(tmp_path: Path) -> None:
 
 
 @pytest.mark.hazard("H50")
-def test_no_request_needs_a_file_and_a_halt_ends_a_repetition(tmp_path: Path) -> None:
+def test_no_request_needs_a_file_and_a_stop_ends_a_repetition(tmp_path: Path) -> None:
     robot = teaching(tmp_path)
     robot.send(FINISH)
     for path in tmp_path.iterdir():

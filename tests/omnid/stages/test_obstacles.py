@@ -60,7 +60,7 @@ def scans_of(scene: Path) -> list[ObstacleScan]:
     return found.scans
 
 
-def test_the_walls_of_the_corridor_stand_left_and_right(scene: Path) -> None:
+def test_the_walls_of_the_corridor_are_left_and_right(scene: Path) -> None:
     found = scans_of(scene)
     # Left wall between 0.9 and 1.6 m, right wall between 0.8 and 1.4 m from the middle; see corridor().
     scan = found[len(found) // 2]
@@ -102,7 +102,7 @@ class Standing:
         )
 
 
-def test_what_is_known_is_known_again_when_odometry_has_found_its_place_again() -> None:
+def test_the_grid_is_valid_again_when_odometry_recognises_its_landmarks() -> None:
     """A low thing that was seen from farther away: nothing shows it here, so that it would never be found again."""
     base = Standing(HEIGHT_M)
     pairs = [Panoramas(0, 0, *panoramas(stains, 3.0, striped, seed=seed), SHOWN) for seed in range(3)]

@@ -105,7 +105,7 @@ def test_who_has_passed_before_or_comes_after_costs_little_time(at_m: float, beg
 
 @pytest.mark.hazard("H18")
 @pytest.mark.parametrize(("seed", "aside_m"), [(5, 0.3), (6, -0.2)])
-def test_goes_around_a_person_who_comes_along_the_path(seed: int, aside_m: float) -> None:
+def test_the_base_goes_around_a_person_who_comes_along_the_path(seed: int, aside_m: float) -> None:
     base = BaseAmongPeople(seed, (7.0, aside_m), (-0.4, 0.0), 1.0)
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m > 0.1
@@ -113,13 +113,13 @@ def test_goes_around_a_person_who_comes_along_the_path(seed: int, aside_m: float
 
 
 @pytest.mark.hazard("H18")
-def test_stands_when_a_person_walks_into_it() -> None:
+def test_the_base_stops_when_a_person_walks_into_it() -> None:
     base = BaseAmongPeople(5, (7.0, 0.0), (-0.7, 0.0), 1.0)
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m < 0 and base.contact_mps < 0.02
 
 
-def test_follows_a_person_who_walks_ahead_more_slowly() -> None:
+def test_the_base_follows_a_person_who_walks_ahead_more_slowly() -> None:
     base = BaseAmongPeople(6, (1.3, 0.0), (0.25, 0.0), 0.0)
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m > 0.1
@@ -207,7 +207,7 @@ def test_a_patch_that_closes_the_way_is_passed_beside_it(path: DrivePath | None,
 
 
 @pytest.mark.hazard("H31")
-def test_where_no_floor_is_seen_across_the_way_the_drive_ends_and_says_so() -> None:
+def test_a_drive_ends_with_the_reason_where_no_floor_is_seen_across_the_way() -> None:
     base = BaseAmongPatches(Boxes((2.4, -9.0, 2.7, 9.0)), settings=NavigationSettings(give_up_s=4.0, stuck_s=6.0))
     answer = base.run(150)
     assert answer.state is NavigationState.FAILED and " m are left" in answer.reason
@@ -223,7 +223,7 @@ def test_the_base_drives_towards_floor_that_is_not_seen_yet() -> None:
 
 
 @pytest.mark.hazard("H31", "H32")
-def test_does_not_turn_where_the_floor_beside_it_is_unknown_and_backs_out() -> None:
+def test_the_base_backs_out_where_the_floor_beside_it_is_unknown() -> None:
     """Nose to the end of a dead end whose walls are nearer than the floor in view: only the floor behind was seen."""
     beside = Boxes((-0.6, 0.34, 0.9, 0.5), (-0.6, -0.5, 0.9, -0.34), (0.3, -0.4, 0.9, 0.4))
     base = BaseAmongPatches(beside)

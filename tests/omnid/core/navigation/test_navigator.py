@@ -60,7 +60,7 @@ def test_cancel_stops_at_once_and_then_gives_the_wheels_free() -> None:
     assert base.pose[0] < 1.6
 
 
-def test_pause_halts_and_resume_goes_on() -> None:
+def test_a_pause_stops_the_base_and_a_resume_drives_on() -> None:
     base = driving()
     base.navigator.pause("paused by a request")
     assert rest(base, 2.0).state is NavigationState.PAUSED
@@ -101,7 +101,7 @@ def test_a_fault_pauses_the_drive_until_a_person_arms_and_resumes() -> None:
 
 
 @pytest.mark.hazard("H28")
-def test_stops_where_the_map_is_lost_for_too_far_and_goes_on_when_it_is_found() -> None:
+def test_a_drive_waits_where_the_map_is_lost_for_too_far() -> None:
     base = driving(NavigationFrame.MAP)
     base.localised, x = False, base.pose[0]
     base.run(20, lambda answer: answer.state is NavigationState.NOT_LOCALISED)
@@ -112,7 +112,7 @@ def test_stops_where_the_map_is_lost_for_too_far_and_goes_on_when_it_is_found() 
 
 
 @pytest.mark.hazard("H28")
-def test_fails_where_the_map_is_not_found_again() -> None:
+def test_a_drive_fails_where_the_map_is_not_found_again() -> None:
     base = driving(NavigationFrame.MAP)
     base.localised = False
     answer = base.run(60)
@@ -133,7 +133,7 @@ def test_a_new_odom_ends_a_drive_in_it_and_a_drive_in_the_map_waits_for_its_plac
 
 
 @pytest.mark.hazard("H31")
-def test_gives_up_without_progress() -> None:
+def test_a_drive_fails_without_progress() -> None:
     base = driving()
     base.slip = 0.0
     answer = base.run(20)
@@ -141,7 +141,7 @@ def test_gives_up_without_progress() -> None:
 
 
 @pytest.mark.hazard("H30")
-def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
+def test_a_drive_waits_for_the_operator_and_fails_far_from_its_path() -> None:
     base = driving()
     for _ in range(100):
         base.law.take(TimedSetpoint(round(base.t_s * 1e9), Setpoint(0.0), OPERATOR))
@@ -238,7 +238,7 @@ def to_goal(base: DrivenBase, x: float, y: float, heading: float | None) -> None
     ],
 )
 @pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 4), marks=pytest.mark.slow)])
-def test_reaches_goals_within_3_cm_and_1_degree(goal: tuple[float, float, float], first: int, seeds: range) -> None:
+def test_the_base_reaches_goals_within_3_cm(goal: tuple[float, float, float], first: int, seeds: range) -> None:
     for seed in (first + more for more in seeds):
         base = DrivenBase(Navigator(NavigationSettings()), seed)
         to_goal(base, *goal)
@@ -248,7 +248,7 @@ def test_reaches_goals_within_3_cm_and_1_degree(goal: tuple[float, float, float]
         assert abs(base.v) < 0.01 and abs(base.w) < 0.01, "every end is a stop"
 
 
-def test_drives_a_square_of_10_m_and_turns_at_its_corners() -> None:
+def test_the_base_drives_a_square_of_10_m_and_turns_at_its_corners() -> None:
     corners = [(0.0, 0.0), (2.5, 0.0), (2.5, 2.5), (0.0, 2.5), (0.0, 0.0)]
     path = drive_path(corners, 0.0)
     assert len(path.legs) == 4
@@ -265,7 +265,7 @@ def test_drives_a_square_of_10_m_and_turns_at_its_corners() -> None:
         assert np.percentile(beside, 95) < 0.05
 
 
-def test_follows_curves_within_5_cm_and_slows_down_in_them() -> None:
+def test_the_base_follows_curves_within_5_cm_and_slows_down_in_them() -> None:
     s = np.linspace(0, 4 * math.pi, 200)
     points = np.column_stack([s, np.sin(1.5 * s)])
     base = DrivenBase(Navigator(NavigationSettings()), 1)
@@ -279,7 +279,7 @@ def test_follows_curves_within_5_cm_and_slows_down_in_them() -> None:
     assert max(speeds) > 0.3 and min(speeds) < 0.8 * max(speeds)
 
 
-def test_drives_backwards_where_the_path_was_driven_so() -> None:
+def test_the_base_drives_backwards_where_the_path_was_driven_so() -> None:
     points = [(0.0, 0.0), (2.0, 0.0), (1.0, 0.0)]
     path = drive_path(points, 0.0, backwards=[False, False, True])
     assert [leg.backwards for leg in path.legs] == [False, True]
@@ -290,7 +290,7 @@ def test_drives_backwards_where_the_path_was_driven_so() -> None:
     assert max(abs(float(sample.pose[2])) for sample in base.samples) < 0.3, "it does not turn round"
 
 
-def test_follows_the_map_when_it_is_corrected() -> None:
+def test_the_base_follows_the_map_when_it_is_corrected() -> None:
     base = DrivenBase(Navigator(NavigationSettings()), 6, T_map_odom=(1.0, -0.5, 0.4))
     pose = base.seen().map_pose()
     goal = pose + np.array([3.0, 1.0, 0.2])

@@ -95,7 +95,7 @@ def clearance_m(base: BaseAmongBoxes) -> float:
         Boxes((2.4, -0.2, 2.8, 0.2), (-1.0, 1.2, 7.0, 1.4), (-1.0, -1.4, 7.0, -1.2)),
     ],
 )
-def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
+def test_the_base_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
     base = drive(boxes, 1)
     assert base.run(90, rest_s=0.3).state is NavigationState.REACHED
     assert base.error((5.0, 0.0, 0.0))[0] < 0.03
@@ -114,7 +114,7 @@ def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
         Boxes((4.8, -0.2, 5.2, 0.2)),
     ],
 )
-def test_waits_where_there_is_no_way_and_says_so(boxes: Boxes) -> None:
+def test_the_base_waits_without_a_way_and_gives_the_reason(boxes: Boxes) -> None:
     base = drive(boxes, 1)
     base.run(90, lambda answer: answer.state is NavigationState.BLOCKED)
     answer = base.run(2, lambda _: True, rest_s=6.0)
@@ -124,14 +124,14 @@ def test_waits_where_there_is_no_way_and_says_so(boxes: Boxes) -> None:
     assert abs(base.v) < 0.01
 
 
-def test_goes_on_when_the_way_becomes_free() -> None:
+def test_the_base_drives_on_when_the_way_becomes_free() -> None:
     base = drive(Boxes((2.5, -3.0, 2.7, 3.0)), 2)
     base.run(60, lambda answer: answer.state is NavigationState.BLOCKED)
     base.boxes = Boxes()
     assert base.run(60).state is NavigationState.REACHED
 
 
-def test_without_a_corridor_it_stays_on_the_path() -> None:
+def test_the_base_stays_on_the_path_without_a_corridor() -> None:
     base = drive(Boxes((2.5, -0.2, 2.9, 0.2)), 3, NavigationSettings(corridor_m=0.0))
     base.run(60, lambda answer: answer.state is NavigationState.BLOCKED, rest_s=20.0)
     assert base.samples[-1].navigation.state is NavigationState.BLOCKED
@@ -144,7 +144,7 @@ def test_walls_beside_the_path_change_nothing() -> None:
     assert not any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
 
 
-def test_a_base_that_stands_too_near_drives_away() -> None:
+def test_a_base_that_begins_too_near_drives_away() -> None:
     base = drive(Boxes((-0.5, -0.4, 0.2, -0.32)), 5)
     assert base.run(60).state is NavigationState.REACHED
 
@@ -196,7 +196,7 @@ def test_a_goal_that_cannot_be_reached_ends_with_what_is_in_the_way(goal: tuple[
     assert clearance_m(base) > 0.02
 
 
-def test_a_long_way_round_is_taken_once_as_much_was_lost_by_waiting() -> None:
+def test_a_long_detour_begins_after_as_long_a_wait() -> None:
     wall = (2.5, -3.5, 2.7, -0.5), (2.5, 0.5, 2.7, 3.5)
     person = Boxes(*wall, (2.3, -0.3, 2.8, 0.3))
     for leaves in (True, False):

@@ -119,7 +119,7 @@ def test_a_keyframe_of_another_map_does_not_count() -> None:
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.2, 0.0), (4.0, 2.0, 0.3), (0.3, -0.6, 2.0)])
-def test_is_repeated_from_anywhere_on_it(start: tuple[float, float, float]) -> None:
+def test_a_route_is_repeated_from_anywhere_on_it(start: tuple[float, float, float]) -> None:
     poses = way()
     places = Map(poses)
     route = taught(poses, places)
@@ -160,7 +160,7 @@ def test_the_whole_route_is_driven_from_its_start_only() -> None:
         repeated_paths(route, places.keyframes, poses[-1], loops=1, reverse=False)
 
 
-def test_is_driven_back_and_there_again_and_in_rounds() -> None:
+def test_a_route_is_driven_there_and_back_and_in_rounds() -> None:
     poses = way(4.0)
     places = Map(poses)
     route = taught(poses, places)
@@ -234,7 +234,7 @@ def test_other_points_are_no_path_and_the_message_says_why(points: ArrayLike, wo
         ("repeat hall from=start loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2, True)),
     ],
 )
-def test_requests_about_routes(text: str, expected: RouteRequest) -> None:
+def test_texts_are_parsed_as_requests_about_routes(text: str, expected: RouteRequest) -> None:
     assert route_request(text) == expected
 
 
@@ -259,7 +259,7 @@ def test_other_texts_are_refused_in_one_line(text: str) -> None:
 
 
 @pytest.mark.parametrize("verb", list(NavigationVerb))
-def test_verbs(verb: NavigationVerb) -> None:
+def test_texts_are_parsed_as_verbs(verb: NavigationVerb) -> None:
     assert navigation_verb(f" {verb}\n") is verb
     with pytest.raises(OmnidError):
         navigation_verb(verb.upper())
