@@ -124,11 +124,11 @@ def _lines(settings: Any, default: Any, path: Path, wanted: Collection[str] | No
     for name, kind in types.items():
         if is_section(kind) or (wanted is not None and ".".join((*path, name)) not in wanted):
             continue
-        value, usual = getattr(settings, name), getattr(default, name)
+        value, default_value = getattr(settings, name), getattr(default, name)
         lines.append(f"# {next(found for found in get_args(kind)[1:] if isinstance(found, str))}")
         if wanted is None:
-            lines.append(f"# {described(kind)}; default {toml_value(usual)}")
-        is_off = wanted is not None and value == usual
+            lines.append(f"# {described(kind)}; default {toml_value(default_value)}")
+        is_off = wanted is not None and value == default_value
         lines.append(f"{'# ' if is_off else ''}{name} = {toml_value(value)}")
     if lines and path:
         yield from ("", f"[{'.'.join(path)}]")

@@ -1,4 +1,4 @@
-"""Test of a base's wiring: each motor turns alone, a person says which wheel moved, and the settings follow from that.
+"""Test of a base's wiring: each motor turns alone, a person names the wheel that moved, and the settings follow.
 
 The wheels must not touch the ground. Commands go straight to the motor controller, without a daemon.
 """

@@ -1,6 +1,6 @@
-"""`omnid listen`, `omnid drive`, `omnid goto` and `omnid route`: a robot followed and asked over the bus.
+"""`omnid listen`, `omnid drive`, `omnid goto` and `omnid route`: clients that show a robot and send it requests.
 
-Begin with `robot_state.py`: the newest message of each topic of a robot, with counts of what was missed, how
-`omnid listen` shows it, stops, and the progress of a drive until its end. `teleop.py` drives by the keyboard. A client
-of the bus as any other: it imports no stage.
+Begin with `robot_state.py`: the newest message of each topic of a robot, with counts of what was missed, the
+display of `omnid listen`, stops, and the progress of a drive until its end. `teleop.py` drives by the keyboard. The
+package imports no stage.
 """

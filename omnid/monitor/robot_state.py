@@ -31,7 +31,7 @@ LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 _INBOX_DEPTH: Final = 2000
 _RECENT: Final = 100  # poses
 
-SILENCE_S: Final = ANSWER_S  # A robot that sends no report for this time counts as gone.
+SILENCE_S: Final = ANSWER_S  # A robot that sends no report for this time counts as lost.
 # Time between two stops over the bus, and until the first: a datagram without an answer by then is behind a router.
 REPEAT_S: Final = 0.15
 

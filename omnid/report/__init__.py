@@ -1,4 +1,4 @@
-"""One HTML page about a recording: what the robot did, how sure it was, and what went wrong.
+"""One HTML page about a recording: what the robot did, how certain it was, and what went wrong.
 
 `recorded_run.py` reads a recording into arrays once, `report.py` is the list of charts and tables, `charts.py` draws
 them with a small vendored library, `page.py` has the style that reports of calibrations share. The page needs no

@@ -64,7 +64,7 @@ class Geometry:
 
 
 def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:
-    """Return the geometry of a rig; a camera without a mask shows what MountedCamera.visible says."""
+    """Return the geometry of a rig; the view of a camera without a mask is MountedCamera.visible."""
     return Geometry(rig, fit_cylinder(rig, config.width_px, config.elevation_deg, config.scale))
 
 

@@ -95,7 +95,7 @@ class Follower:
     ) -> Following:
         """Return the motion at a pose (3,) with its measured speeds.
 
-        obstacle_m: from the outline of the base to the nearest obstacle beside the way.
+        obstacle_m: from the outline of the base to the nearest obstacle next to the path.
         """
         # 1. Follow the legs from the pose at which the command takes effect; each ends a little before its end, the
         #    last one as near as the goal has to be reached.

@@ -47,7 +47,7 @@ RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after 
 AROUND: Final = "it looks for a way around an obstacle"
 WAITS: Final = "it goes on by itself when the way is free"
 OBSTRUCTED: Final = "an obstacle is on the path"
-CROSSES: Final = "somebody or something crosses the path"
+CROSSES: Final = "a moving object crosses the path"
 
 
 class Detour(NamedTuple):

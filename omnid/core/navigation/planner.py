@@ -118,7 +118,7 @@ class Planner:
         if is_free:
             left_s[row, column] = 0.0
         elif is_inside:
-            # An obstacle that from afar seems to be at the goal may be beside it: drive as near as is free, to see.
+            # An obstacle seen from afar at the goal may be next to it: drive as near as is free, to see it better.
             least_m = float(away_m[is_open].min())
             if math.dist(goal, pose[:2]) < least_m + LOOK_M:
                 return f"an obstacle is {_nearest_m(goal, around):.1f} m from the goal"
