@@ -231,8 +231,9 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         map_name = config.places.map if places else ""
         stage = NavigationStage(config.navigation, *of_base, map_name, files.routes, is_new=run_map.is_new)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
-        inbox: list[Stream[Any] | None] = [poses, in_map, scans, wheels, requests]
-        ways = graph.stage("navigation", stage, *(stream for stream in inbox if stream is not None))
+        streams: list[Stream[Any] | None] = [poses, in_map, scans, wheels, requests]
+        inbox = [stream for stream in streams if stream is not None]
+        ways = graph.stage("navigation", stage, *inbox)
         answers.append(graph.stage("answers", navigation_answers, ways, thread=ways.thread))
         answers.append(graph.stage("taught", files.write, ways, thread=FILES))
         if controller is not None:

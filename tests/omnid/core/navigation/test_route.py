@@ -174,15 +174,15 @@ def test_a_route_is_driven_there_and_back_and_in_rounds() -> None:
     scan = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a])
     closed = taught(scan, Map(scan))
     assert closed.is_closed
-    rounds = repeated_paths(closed, Map(scan), np.zeros(3), loops=3, reverse=False)
+    rounds = repeated_paths(closed, Map(scan).keyframes, np.zeros(3), loops=3, reverse=False)
     assert len(rounds) == 3 and rounds[1] is rounds[2] and rounds[1].length_m == pytest.approx(4 * math.pi, abs=0.3)
 
 
 @pytest.mark.hazard("H29")
 def test_a_robot_that_is_not_near_is_refused() -> None:
-    poses = way()
+    route, places = taught(way(), Map(way())), Map(way())
     with pytest.raises(OmnidError, match=r"3\.\d m away from the route: drive it there"):
-        repeated_paths(taught(poses, Map(poses)), Map(poses), np.array([0.0, 3.5, 0.0]), loops=1, reverse=False)
+        repeated_paths(route, places.keyframes, np.array([0.0, 3.5, 0.0]), loops=1, reverse=False)
 
 
 def test_a_piece_that_was_driven_backwards_is_repeated_so() -> None:
