@@ -237,15 +237,6 @@ def parse_ocam(text: str, view: View = "mirror", name: str = "calib_results.txt"
         return OcamCamera(tuple(lines[0][1:]), (row, column), (c, d, e), (int(width), int(height)), view)
 
 
-def read_transform(path: Path) -> Array:
-    """Read T_lower_upper (4, 4): a text of its 16 numbers, row by row."""
-    with within(f"{path}: "):
-        numbers = [number for line in _number_lines(read_text(path)) for number in line]
-        if len(numbers) != 16:
-            raise CalibError(f"expected 16 numbers, the 4 rows of T_lower_upper, found {len(numbers)}")
-        return transform_of([numbers[at : at + 4] for at in range(0, 16, 4)], "T_lower_upper")
-
-
 def _number_lines(text: str) -> list[list[float]]:
     """Return the numbers of each line that has any, without comments (#); ValueError for other words."""
     words = (line.partition("#")[0].replace(",", " ").split() for line in text.splitlines())

@@ -95,11 +95,6 @@ class PairConfig:
 class LogConfig:
     """Reading of logs."""
 
-    rate_hz: Annotated[
-        float,
-        Meta(ge=0, le=1000),
-        "images per second of folders; 0: their names or times.txt state the times of capture",
-    ] = 0.0
     time: Annotated[
         TimeSource,
         "time of capture of an image: 'header': the stamp of its message, 'log': the time of logging, 'auto': the "

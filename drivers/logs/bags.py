@@ -17,9 +17,11 @@ from urllib.parse import quote
 
 import numpy as np
 from rosbags.rosbag1 import Reader
+from rosbags.typesys import Stores
 
 from drivers.errors import DriverError, RecordError, one_line
 from drivers.logs.log import ENTRY, KEPT_CHUNKS, MAX_RECORD_BYTES, Entries, LogFile, Topic
+from drivers.logs.ros_messages import STAMPED_TYPES, typestore
 
 # A file that is shorter than it states is read up to its end with a writable schema only; it is opened read-only.
 _PRAGMAS: Final = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "writable_schema = ON")
@@ -78,7 +80,7 @@ class SqliteBag(LogFile):
             self.cut = f"the bag {self.name!r} {line}"
         return np.array(found, ENTRY)
 
-    def read(self, block: int, offset: int) -> bytes:
+    def read(self, channel: int, block: int, offset: int) -> bytes:
         """Return the bytes of the message of an entry; raise RecordError where they cannot be read."""
         try:
             row = self._bag.execute("SELECT data FROM messages WHERE rowid = ?", (offset,)).fetchone()
@@ -111,7 +113,7 @@ class Ros1Bag(LogFile):
             reason = f"{one_line(error)}; if its recorder was stopped, try `rosbag reindex`"
             raise DriverError(f"cannot read the bag {self.name!r}: {reason}") from error
         for of in self._bag.connections:
-            self.topics[of.id] = Topic(of.topic, of.msgtype, aligned=False)
+            self.topics[of.id] = Topic(of.topic, of.msgtype)
         self._chunk = lru_cache(KEPT_CHUNKS)(self._unpacked)
 
     def entries(self) -> Entries:
@@ -124,20 +126,25 @@ class Ros1Bag(LogFile):
         found = []
         for block, offset, channel, time_ns in sorted(places):
             try:
-                found.append((channel, time_ns, self.header_ns(channel, self.read(block, offset)), block, offset))
+                header_ns = self.header_ns(channel, self.read(channel, block, offset))
+                found.append((channel, time_ns, header_ns, block, offset))
             except RecordError as error:
                 self.faults.setdefault(block, str(error))
         return np.array(found, ENTRY)
 
-    def read(self, block: int, offset: int) -> memoryview:
-        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
+    def read(self, channel: int, block: int, offset: int) -> memoryview:
+        """Return the bytes of the message of an entry, in CDR those of STAMPED_TYPES; raise RecordError for others."""
         data = self._chunk(block)
         for _ in ("head", "data"):
             size = int.from_bytes(data[offset : offset + _LENGTH.size], "little")
             begin, offset = offset + _LENGTH.size, offset + _LENGTH.size + size
         if not begin < offset <= len(data):
             raise RecordError(f"the chunk at byte {block}: the message at its byte {offset} is not whole")
-        return data[begin:offset]
+        kind, message = self.topics[channel].kind, data[begin:offset]
+        try:
+            return typestore(Stores.ROS2_HUMBLE).ros1_to_cdr(message, kind) if kind in STAMPED_TYPES else message
+        except Exception as error:  # of any kind, as it trusts the lengths in the bytes
+            raise RecordError(f"the chunk at byte {block}: a {kind} at its byte {begin} is not valid") from error
 
     def _unpacked(self, block: int) -> memoryview:
         """Return the content of a chunk; raise RecordError where it does not unpack."""

@@ -1,17 +1,15 @@
 """Folders of images, one folder for each camera.
 
-When an image was taken is stated in one of three ways:
+When an image was taken is stated in one of two ways:
 
-1. `rate_hz`: so many images a second, in the natural order of their names, from 0 s on;
-2. times.txt or timestamps.txt in the folder of the images or the one above: a line with a stamp for each image, in the
+1. times.txt or timestamps.txt in the folder of the images or the one above: a line with a stamp for each image, in the
    natural order of their names: seconds, or nanoseconds of 16 to 19 digits;
-3. its name: nanoseconds of 16 to 19 digits as of EuRoC (1403636579763555584.png), or seconds with a decimal point as of
+2. its name: nanoseconds of 16 to 19 digits as of EuRoC (1403636579763555584.png), or seconds with a decimal point as of
    TUM.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Sequence
@@ -51,28 +49,19 @@ class ImageFolder(LogFile):
     Raises DriverError where an image has no stamp.
     """
 
-    def __init__(self, path: Path, folders: Sequence[Path], rate_hz: float = 0.0) -> None:
-        """rate_hz: images a second; 0: their names or a list state their stamps."""
+    def __init__(self, path: Path, folders: Sequence[Path]) -> None:
         super().__init__(path)
-        if not 0.0 <= rate_hz < math.inf:
-            raise DriverError(f"{self.name!r}: a rate of {rate_hz:g} images a second is given: expected one above 0")
         self._path = path
         self._images: list[tuple[int, int, Path]] = []  # folder, stamp [ns], file
-        counts = dict[str, int]()
         for number, folder in enumerate(folders):
-            stamped = _stamped(folder, rate_hz)
-            self._images += ((number, stamp_ns, image) for stamp_ns, image in sorted(stamped))
+            self._images += ((number, stamp_ns, image) for stamp_ns, image in sorted(_stamped(folder)))
             self.topics[number] = Topic(folder.relative_to(path).as_posix(), COMPRESSED_IMAGE)
-            counts[self.topics[number].name] = len(stamped)
-        if rate_hz and len(set(counts.values())) > 1:
-            found = ", ".join(f"{count} in {topic!r}" for topic, count in counts.items())
-            raise DriverError(f"{self.name!r}: found {found}: a rate needs as many of each camera; write times.txt")
 
     def entries(self) -> Entries:
         """Return the places of the images."""
         return np.array([(f, ns, ns, 0, number) for number, (f, ns, _) in enumerate(self._images)], ENTRY)
 
-    def read(self, block: int, offset: int) -> bytes:
+    def read(self, channel: int, block: int, offset: int) -> bytes:
         """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable."""
         _, stamp_ns, path = self._images[offset]
         try:
@@ -89,11 +78,9 @@ class ImageFolder(LogFile):
         """Do nothing: no file is kept open."""
 
 
-def _stamped(folder: Path, rate_hz: float) -> list[tuple[int, Path]]:
+def _stamped(folder: Path) -> list[tuple[int, Path]]:
     """Return stamp [ns] and path of the images of a folder; raise DriverError where one has no stamp."""
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name) and path.is_file()), key=_numbers_of)
-    if rate_hz:
-        return [(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
     # A whole number of fewer digits is no time.
     texts = [path.stem if "." in path.stem or _NANOSECONDS.fullmatch(path.stem) else "" for path in paths]
     lists = [file for place in (folder, folder.parent) for name in _LISTS if (file := place / name).is_file()]
@@ -116,8 +103,8 @@ def _stamp_ns(text: str, image: Path) -> int:
         if 0 <= stamp_ns < LATEST_NS and "_" not in text:
             return int(stamp_ns)
     raise DriverError(
-        f"{str(image)!r} has no stamp: expected nanoseconds of 16 to 19 digits as its name, or seconds in {_LISTS[0]}; "
-        "else give --rate HZ, which is log.rate_hz of the settings"
+        f"{str(image)!r} has no stamp: expected nanoseconds of 16 to 19 digits as its name, or a line for each image "
+        f"with its seconds in {_LISTS[0]}"
     )
 
 

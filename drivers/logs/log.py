@@ -39,7 +39,6 @@ class Topic(NamedTuple):
 
     name: str
     kind: str  # "" where its messages cannot be decoded
-    aligned: bool = True  # True: CDR (ROS 2); False: the serialisation of ROS 1
 
 
 class LogFile(ABC):
@@ -58,7 +57,7 @@ class LogFile(ABC):
         """Return the places of all messages of known topics, in any order."""
 
     @abstractmethod
-    def read(self, block: int, offset: int) -> bytes | memoryview:
+    def read(self, channel: int, block: int, offset: int) -> bytes | memoryview:
         """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
 
     def attachments(self) -> dict[str, bytes]:
@@ -73,9 +72,8 @@ class LogFile(ABC):
         """
         if channel not in self.topics:
             raise RecordError(f"the channel {channel} of messages is unknown")
-        topic = self.topics[channel]
-        is_stamped = topic.kind in STAMPED_TYPES
-        return header_stamp(unpack_message(memoryview(start)), aligned=topic.aligned) if is_stamped else 0
+        is_stamped = self.topics[channel].kind in STAMPED_TYPES
+        return header_stamp(unpack_message(memoryview(start))) if is_stamped else 0
 
     @abstractmethod
     def close(self) -> None:
@@ -89,22 +87,15 @@ class LoggedMessage:
     topic: str
     kind: str  # ROS type such as sensor_msgs/msg/Image; "" where the message cannot be decoded
     log_time_ns: int
-    data: memoryview
-    aligned: bool = True  # True: CDR (ROS 2); False: the serialisation of ROS 1
-
-    def cdr(self) -> bytes:
-        """Return the bytes in CDR; raise RecordError for a message of ROS 1."""
-        if not self.aligned:
-            raise RecordError(f"a {self.kind} of ROS 1 is not read: convert the log by `rosbags-convert`")
-        return bytes(self.data)
+    data: memoryview  # CDR
 
     def image(self) -> Frame:
         """Return the image of an image message, see `parse_image`."""
-        return parse_image(self.kind, self.data, aligned=self.aligned)
+        return parse_image(self.kind, self.data)
 
     def motion(self) -> MotionSample:
         """Return the sample of wheels or an IMU."""
-        return parse_motion(self.kind, self.data, aligned=self.aligned)
+        return parse_motion(self.kind, self.data)
 
 
 class Log:
@@ -157,12 +148,12 @@ class Log:
         file, name = self.files[self.file[row]], self._names[self.topic[row]]
         channel, time_ns, _, block, offset = self.entries[row].item()
         try:
-            data = unpack_message(memoryview(file.read(block, offset)))
+            data = unpack_message(memoryview(file.read(channel, block, offset)))
         except RecordError as error:
             if not self._closed:
                 file.faults.setdefault(block or offset, str(error))
             return None
-        return LoggedMessage(name, self.topics[name], time_ns, data, file.topics[channel].aligned)
+        return LoggedMessage(name, self.topics[name], time_ns, data)
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments of the first file that has some, such as a rig."""

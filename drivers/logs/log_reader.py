@@ -28,7 +28,6 @@ from drivers.logs.bags import Ros1Bag, SqliteBag
 from drivers.logs.image_folder import ImageFolder, image_folders
 from drivers.logs.log import Log, LogFile, listed
 from drivers.logs.mcap_file import McapFile
-from drivers.logs.mcap_writer import is_locked
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, ODOMETRY
 from drivers.motion import MotionSample
 
@@ -45,11 +44,11 @@ def is_log_name(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
 
 
-def open_log(path: str | os.PathLike[str], rate_hz: float = 0.0) -> Log:
+def open_log(path: str | os.PathLike[str]) -> Log:
     """Open a log. Raise DriverError, which names the supported kinds, for anything else.
 
     path: an MCAP file, an SQLite bag of ROS 2 (.db3), a bag of ROS 1 (.bag), a folder with one of these or with the
-    parts of one, or a folder with a folder of images for each camera. rate_hz: see `ImageFolder`.
+    parts of one, or a folder with a folder of images for each camera.
     """
     given = Path(path)
     parts = [given]
@@ -61,7 +60,7 @@ def open_log(path: str | os.PathLike[str], rate_hz: float = 0.0) -> Log:
         except OSError as error:
             raise DriverError(f"cannot read the folder {str(given)!r}: {error.strerror}") from error
         if folders:
-            return Log(given, [ImageFolder(given, folders, rate_hz)])
+            return Log(given, [ImageFolder(given, folders)])
         if not parts:
             raise DriverError(
                 f"{str(given)!r} must contain one log ({' '.join(LOG_SUFFIXES)}, unpacked), the numbered parts of one, "
@@ -94,9 +93,8 @@ def _open_file(path: Path) -> LogFile:
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """Return the logs in a folder by their names, without those being written. Raise OSError where it is unreadable."""
-    files = sorted(folder.iterdir())
-    return [file for file in files if is_log_name(file.name) and file.is_file() and not is_locked(file)]
+    """Return the logs in a folder by their names. Raise OSError where it is unreadable."""
+    return [file for file in sorted(folder.iterdir()) if is_log_name(file.name) and file.is_file()]
 
 
 def parts_in_order(logs: list[Path]) -> list[Path]:
@@ -237,7 +235,6 @@ class LogCameras(NamedTuple):
     lower: str | None = None  # topics, where their names do not identify the cameras
     upper: str | None = None
     bits: int = 16  # of the samples of images of 16 bits, see Frame
-    rate_hz: float = 0.0  # see `ImageFolder`
     time: TimeSource = "auto"  # which of its two times a message is stamped with, see `choose_stamps`
 
 
@@ -268,7 +265,7 @@ class LogReader:
         motion: MotionTopics | None = None,
     ) -> None:
         self._closed, self._span_s, self._cameras = False, span_s, cameras
-        self._log = open_log(path, cameras.rate_hz)
+        self._log = open_log(path)
         self._motion, self._motion_warnings = set[str](), list[str]()
         self.counts, self.warnings = Counter[str](), list[str]()
         try:

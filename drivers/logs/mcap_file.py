@@ -9,7 +9,6 @@ No index or summary of a file is used: the head of each message is read where it
 from __future__ import annotations
 
 import os
-import re
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -127,7 +126,7 @@ class McapFile(LogFile):
             self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {size}{used}"
         return np.concatenate(found)
 
-    def read(self, block: int, offset: int) -> memoryview:
+    def read(self, channel: int, block: int, offset: int) -> memoryview:
         """Return the bytes of the message of an entry; raise RecordError where they are gone."""
         return self._record(self._chunk(block) if block else self._file, offset).content()[_MESSAGE.size :]
 
@@ -189,16 +188,10 @@ class McapFile(LogFile):
         """Add a channel or a schema; raise RecordError where it is malformed."""
         if record.opcode == Opcode.SCHEMA:
             found = record.parsed(Schema)
-            self._types.setdefault(found.id, _ros_name(found.name))
+            self._types.setdefault(found.id, found.name)
         elif record.opcode == Opcode.CHANNEL:
             found = record.parsed(Channel)
             if found.schema_id not in self._types:
                 raise RecordError(f"the schema {found.schema_id} of the channel {found.id} is unknown")
-            kind = self._types[found.schema_id] if found.message_encoding in ("cdr", "ros1") else ""
-            self.topics.setdefault(found.id, Topic(found.topic, kind, found.message_encoding != "ros1"))
-
-
-def _ros_name(schema_name: str) -> str:
-    """Return package/msg/Type for this, for DDS (sensor_msgs::msg::dds_::Image_) and for ROS 1 (sensor_msgs/Image)."""
-    parts = [part for part in re.split(r"/|::", schema_name) if part not in ("msg", "dds_")]
-    return f"{parts[0]}/msg/{parts[1].rstrip('_')}" if len(parts) == 2 else schema_name
+            kind = self._types[found.schema_id] if found.message_encoding == "cdr" else ""
+            self.topics.setdefault(found.id, Topic(found.topic, kind))

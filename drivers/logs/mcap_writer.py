@@ -2,13 +2,11 @@
 
 Several files continue while the disk has space, and never stop the program. They are <name>_20260131T235900Z_001.mcap:
 the time is that of the first message, UTC; the number counts the files of one run and those of the same second. No
-files with other names are deleted. Several programs may share a folder: a file being written is locked. One that was
-left by a program that crashed is readable up to its end.
+files with other names are deleted. A file that was left by a program that crashed is readable up to its end.
 """
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import math
 import os
@@ -20,7 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
 from mcap.exceptions import McapError
 from mcap.writer import CompressionType, Writer
@@ -44,7 +42,7 @@ class LogWriter:
     """Writes a log; a crash loses at most the last chunk, or half a second of stamps.
 
     attachments (name -> bytes) are written first, so that they survive a crash. JPEG images are not made smaller by a
-    compression. An existing file is replaced, unless exclusive. The file is locked until it is closed.
+    compression. An existing file is replaced, unless exclusive.
     Raises DriverError where the file cannot be created or written (a full disk).
 
     messages: number of messages written; persisted: number of those that would survive a crash now; size_bytes: of the
@@ -68,7 +66,6 @@ class LogWriter:
             raise DriverError(
                 f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
             ) from error
-        lock(self._file)
         self.usable, self._flushed_ns = True, -1  # usable: until it is closed or fails
         try:
             with self._guarded():
@@ -161,26 +158,6 @@ class LogWriter:
 def _schema_text(schema_name: str) -> str:
     """Return the definition of a ROS 2 type and of all its parts."""
     return typestore(Stores.ROS2_HUMBLE).generate_msgdef(schema_name, ros_version=2)[0]
-
-
-# Advisory locks that mark a file as being written; the kernel releases them when the program ends.
-
-
-def lock(file: IO[bytes]) -> None:
-    """Mark an open file as being written until it is closed; without effect where the file system has no locks."""
-    with suppress(OSError):
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_locked(path: str | os.PathLike[str]) -> bool:
-    """True if a program, this one included, is writing the file; False where it cannot be opened."""
-    try:
-        if Path(path).is_file():
-            with open(path, "rb") as file:
-                fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:
-        return isinstance(error, BlockingIOError)
-    return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +277,7 @@ class RotatingLog:
     def _delete_oldest(self) -> None:
         """Delete the oldest recordings of this name until there is room for one more within the limit.
 
-        Files that are being written, or cannot be deleted, are kept, and links are none.
+        Files that cannot be deleted are kept, and links are none.
         """
         pattern = re.compile(re.escape(self._name) + r"_\d{8}T\d{6}Z_\d{3,}\.mcap")
         with suppress(OSError):
@@ -310,10 +287,9 @@ class RotatingLog:
             for path in [*sizes]:
                 if sum(sizes.values()) <= self._rotation.keep_bytes - self._rotation.file_bytes:
                     break
-                if not is_locked(path):
-                    path.unlink()
-                    del sizes[path]
-                    self.state.deleted += 1
+                path.unlink()
+                del sizes[path]
+                self.state.deleted += 1
 
     def _require_free_space(self, wanted_bytes: int) -> None:
         """Create the folder; raise DriverError where it cannot be created, or the disk has less free space."""

@@ -1,4 +1,4 @@
-"""Images, wheels and gyros in the messages of ROS 2 (CDR) and ROS 1, decoded by rosbags, which copies no image."""
+"""Images, wheels and gyros in the messages of ROS 2 (CDR), decoded by rosbags, which copies no image."""
 
 from __future__ import annotations
 
@@ -36,13 +36,12 @@ _SYNONYMS: Final = {
 _MAGIC: Final = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
 
 
-def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> Frame:
+def parse_image(kind: str, message: memoryview) -> Frame:
     """Return the image in a message of type IMAGE or COMPRESSED_IMAGE, as frame 0 of the lower camera.
 
-    Its stamp is that of the header, 0 if unset. Raise FrameDecodeError where the message is invalid. aligned: True for
-    CDR (ROS 2), False for the serialisation of ROS 1.
+    Its stamp is that of the header, 0 if unset. Raise FrameDecodeError where the message is invalid.
     """
-    found = _decoded(kind, message, aligned)
+    found = _decoded(kind, message)
     stamp_ns, data = _stamp_ns(found.header.stamp.sec, found.header.stamp.nanosec), memoryview(found.data)
     if kind == IMAGE:
         encoding, is_big = _SYNONYMS.get(found.encoding, found.encoding), bool(found.is_bigendian)
@@ -63,13 +62,12 @@ def compressed_image(stamp_ns: int, image: bytes) -> bytes:
     return head + image
 
 
-def parse_motion(kind: str, message: memoryview, *, aligned: bool = True) -> MotionSample:
+def parse_motion(kind: str, message: memoryview) -> MotionSample:
     """Return the sample in a message of type ODOMETRY or IMU.
 
-    Its stamp is that of the header, 0 if unset. Raise FrameDecodeError where the message is invalid. aligned: True for
-    CDR (ROS 2), False for the serialisation of ROS 1.
+    Its stamp is that of the header, 0 if unset. Raise FrameDecodeError where the message is invalid.
     """
-    found = _decoded(kind, message, aligned)
+    found = _decoded(kind, message)
     stamp_ns = _stamp_ns(found.header.stamp.sec, found.header.stamp.nanosec)
     if kind == ODOMETRY:
         velocity_mps, yaw_rate_radps = found.twist.twist.linear.x, found.twist.twist.angular.z
@@ -84,23 +82,21 @@ def parse_motion(kind: str, message: memoryview, *, aligned: bool = True) -> Mot
     return GyroSample(stamp_ns, x, y, z, of_base=found.header.frame_id == BASE_FRAME)
 
 
-def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
+def _decoded(kind: str, message: memoryview) -> Any:
     """Return a message as rosbags decodes it; raise FrameDecodeError for other bytes."""
-    store = typestore(Stores.ROS2_HUMBLE if aligned else Stores.ROS1_NOETIC)
     try:
-        return store.deserialize_cdr(message, kind) if aligned else store.deserialize_ros1(message, kind)
+        return typestore(Stores.ROS2_HUMBLE).deserialize_cdr(message, kind)
     except Exception as error:  # of any kind, as it trusts the lengths in the bytes
         raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated or invalid") from error
 
 
-def header_stamp(message: memoryview, *, aligned: bool = True) -> int:
+def header_stamp(message: memoryview) -> int:
     """Return the stamp [ns] of the header with which images, wheels and IMUs begin; 0 where unset, -1 where cut."""
     start = bytes(message[: _HEADER.size])
     if len(start) < _HEADER.size:
         return -1
-    # CDR states its byte order; ROS 1 begins with a sequence number, and its seconds have no sign.
-    layout = (_HEADER.format if start[1] & 1 else ">4xiI") if aligned else "<4xII"
-    return _stamp_ns(*struct.unpack(layout, start))
+    # CDR states its byte order.
+    return _stamp_ns(*struct.unpack(_HEADER.format if start[1] & 1 else ">4xiI", start))
 
 
 typestore = cache(get_typestore)

@@ -15,7 +15,7 @@ import numpy as np
 from calib import se3
 from calib.atomic_file import write_file
 from calib.boards.board import AnyBoard, AprilGrid, Board
-from calib.importers import import_pair, parse_chain, read_transform, stacked_rig, straight_up
+from calib.importers import import_pair, parse_chain, stacked_rig, straight_up
 from calib.models.names import model_in_words
 from calib.rig import Rig
 from calib.rig_file import png, read_rig, write_rig
@@ -256,17 +256,14 @@ def import_rig(args: argparse.Namespace) -> int:
         the origin at the lower viewpoint, z to the upper one, x ahead
     -o, --output FILE           the rig.toml to write (required)
     --replace                   write it in the place of an existing file
-
-    one of:
-    --transform FILE  the 16 numbers of T_lower_upper, row by row
-    --baseline M 0.001..5  metres from the lower viewpoint straight up to the upper one; both cameras look up and are
-        equally oriented
+    --baseline M 0.001..5       metres from the lower viewpoint straight up to the upper one; both cameras look up and
+        are equally oriented
 
     examples:
       calibrate import camchain.yaml -o rig.toml
       calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml
     """
-    read = [path for path in (args.camchain, args.lower, args.upper, args.transform) if path]
+    read = [path for path in (args.camchain, args.lower, args.upper) if path]
     check_outputs([("--output", args.output)], [("a file that is read", Path(path)) for path in read])
     rig = _imported(args)
     if args.height_m is not None:
@@ -283,19 +280,19 @@ def import_rig(args: argparse.Namespace) -> int:
 
 
 def _imported(args: argparse.Namespace) -> Rig:
-    named = ("camchain", "lower", "upper", "equirectangular", "transform", "baseline", "view")
+    named = ("camchain", "lower", "upper", "equirectangular", "baseline", "view")
     given = {name for name in named if vars(args)[name] is not None}
     if given == {"equirectangular", "baseline"}:
         return stacked_rig(args.equirectangular, args.baseline)
     if "camchain" in given <= {"camchain", "lower", "upper"}:
         text, path = read_text(args.camchain), str(args.camchain)
         return parse_chain(text, path, args.lower or "", args.upper or "", args.frame, options.warn)
-    if given - {"view"} in ({"lower", "upper", "transform"}, {"lower", "upper", "baseline"}):
-        T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
+    if given - {"view"} == {"lower", "upper", "baseline"}:
+        T_lower_upper = straight_up(args.baseline)
         return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", options.warn)
     raise OmnidError(
         "calibrate import: expected a Kalibr camchain.yaml; or two files of OCamCalib as --lower and --upper, with "
-        "--transform FILE or --baseline METRES; or --equirectangular WIDTHxHEIGHT with --baseline METRES"
+        "--baseline METRES; or --equirectangular WIDTHxHEIGHT with --baseline METRES"
     )
 
 
@@ -307,5 +304,5 @@ def height_of(rig: Rig) -> str:
 
 
 def log_cameras(args: argparse.Namespace) -> LogCameras:
-    """Return the cameras of a log by --lower, --upper, --bits, --rate and --time."""
-    return LogCameras(args.lower, args.upper, int(args.bits), args.rate or 0.0, args.time)
+    """Return the cameras of a log by --lower, --upper, --bits and --time."""
+    return LogCameras(args.lower, args.upper, int(args.bits), args.time)

@@ -154,7 +154,7 @@ def two_sides(text: str) -> tuple[int, int]:
 # Types of values by the word that stands for them in the help; a file or a folder is a path, all others are text.
 TYPES: Final[Mapping[str, Callable[[str], Any]]] = {
     **dict.fromkeys(("N", "PX", "BITS"), int),
-    **dict.fromkeys(("X", "S", "M", "MM", "MS", "HZ", "MPS", "FACTOR", "RATIO"), float),
+    **dict.fromkeys(("X", "S", "M", "MM", "MS", "MPS", "FACTOR", "RATIO"), float),
     **dict.fromkeys(("6x7", "6x6", "3840x1920"), two_sides),
 }
 _PATHS: Final = {"FILE", "FOLDER", "DIR", "LOG", "EST", "TRUTH", "OUT"}
@@ -214,19 +214,14 @@ SECONDS: Final = "--seconds S 0.001..1e9  end after S seconds; default: on Ctrl-
 
 # A log, its cameras and its rig.
 RIG: Final = "--rig FILE  the rig.toml of the cameras; default: that attached to the log\n"
-RATE: Final = """
---rate HZ [log.rate_hz]  images per second of folders of images; default: by their names in nanoseconds, or the seconds
-                         in times.txt
-"""
 CAMERAS: Final = """
 --lower TOPIC  images of the lower camera; default: found by name
 --upper TOPIC  images of the upper camera; default: found by name
 """
-LOG: Final = f"{RIG}{CAMERAS}{RATE}"
+LOG: Final = f"{RIG}{CAMERAS}"
 LOG_CAMERAS: Final = f"""{CAMERAS}
 --bits 8|10|12|16=16         bits of the cameras in images of 16 bits a sample
 --time auto|header|log=auto  time of capture of an image: as log.time of the settings
-{RATE}
 """
 
 # Maps of places, and the height of the cameras.

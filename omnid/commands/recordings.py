@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # it imports rerun, which may be missing
 BROKEN = "cut or corrupt"
 
 
-@options.command(options.RATE)
+@options.command()
 def info(args: argparse.Namespace) -> int:
     """Print topics, types, counts, times, attachments, and whether the log is whole.
 
@@ -53,12 +53,12 @@ def info(args: argparse.Namespace) -> int:
 
     examples:
       log info recordings/*.mcap
-      log info images --rate 20
+      log info images
     """
     code = 0
     for number, path in enumerate(args.logs):
         try:
-            log = open_log(path, args.rate or 0.0)
+            log = open_log(path)
         except DriverError as error:
             options.failed(plain(str(error)))
             code = 2

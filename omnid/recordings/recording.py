@@ -102,7 +102,7 @@ class RecordingReader:
                 if name in IMAGES and message.kind in IMAGE_TYPES:
                     content = message.image()
                 elif decode is not None and message.kind == kind:
-                    content = decode(message.cdr())
+                    content = decode(bytes(message.data))
                 else:
                     continue
             except (OmnidError, FrameDecodeError):

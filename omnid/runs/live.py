@@ -266,12 +266,12 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Re
 
 
 def _answer_arming(bus: Bus, state: ControllerState) -> None:
-    """Answer the newest request to arm and those before it; each is answered once."""
+    """Answer the newest request to arm."""
     answer = state.arm_answer
     text = answer.refusal or "armed: it obeys commands from now on"
     if answer.refusal == AWAITED:
         text = f"{AWAITED}: {state.problem}"
-    bus.answer(answer.id, Answer(not answer.refusal, text), also_before=topics.ARM)
+    bus.answer(answer.id, Answer(not answer.refusal, text))
 
 
 def open_recorder(

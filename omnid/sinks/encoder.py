@@ -99,8 +99,8 @@ class Encoder:
                 yield _on("moving", codec.moving_cdr(stamp_ns, "odom", message.moving))
             case MapUpdate():
                 points, step = message.points, len(message.points.xyz) // self._cloud_points + 1
-                cloud = points.xyz[::step], points.confidence[::step]
-                yield _on("cloud", codec.point_cloud_cdr(stamp_ns, "odom", *cloud, T_frame_points=self.T_base_rig))
+                xyz, confidence = se3.apply(self.T_base_rig, points.xyz[::step]), points.confidence[::step]
+                yield _on("cloud", codec.point_cloud_cdr(stamp_ns, "odom", xyz, confidence))
             case GridUpdate():
                 grid = message.grid
                 yield _on("map", codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner))

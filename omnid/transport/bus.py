@@ -149,7 +149,7 @@ class Bus:
         self._queries = {name: self._queryable(name) for name in topics if PUBLISHED[name].latched}
         self._rings: list[Ring] = []  # of commands; those of requests to arm and of stops are the last ones
         self._ids = count(1)
-        self._open: dict[int, tuple[str, zenoh.Query]] = {}  # requests that wait for their answers, by id
+        self._open: dict[int, zenoh.Query] = {}  # requests that wait for their answers, by id
         self._answered: deque[tuple[zenoh.Query, Answer]] = deque(maxlen=MOST_OPEN)
         self._stop_listener: StopListener | None = None
         self._flooded = 0  # floods at the last status
@@ -223,14 +223,10 @@ class Bus:
         for name, command in COMMANDS.items():
             self._node.subscription(name, command.schema)
 
-    def answer(self, id: int, answer: Answer, *, also_before: str = "") -> None:
-        """Answer a request, once, from any thread, without waiting; nothing happens where no query waits for it.
-
-        also_before: a topic on which a request takes the place of earlier ones, which get the same answer.
-        """
-        for other, (topic, query) in self._open.copy().items():
-            if (other == id or (other < id and topic == also_before)) and self._open.pop(other, None) is not None:
-                self._answered.append((query, answer))
+    def answer(self, id: int, answer: Answer) -> None:
+        """Answer a request, once, from any thread, without waiting; nothing happens where no query waits for it."""
+        if (query := self._open.pop(id, None)) is not None:
+            self._answered.append((query, answer))
 
     def close(self) -> None:
         """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""
@@ -322,7 +318,7 @@ class Bus:
         payload, id = b"" if message.payload is None else message.payload.to_bytes(), next(self._ids)
         sender, sent_ns, echo_ns = ros2.read_attachment(message.attachment.to_bytes() if message.attachment else b"")
         if isinstance(message, zenoh.Query):
-            self._open[id] = topic, message
+            self._open[id] = message
             if len(self._open) > MOST_OPEN:  # the oldest one is dropped
                 self._open.pop(min(self._open.copy()), None)
         elif message.source_info is not None:

@@ -332,16 +332,11 @@ class Cloud:
     confidence: Floats  # (N,)
 
 
-def point_cloud_cdr(
-    stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike, *, T_frame_points: Array | None = None
-) -> bytes:
-    """Encode a sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): float32, 16 bytes per point.
-
-    T_frame_points (4, 4) maps the points into `frame`, in double precision; None where they are given in it.
-    """
+def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike) -> bytes:
+    """Encode a sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): float32, 16 bytes per point."""
     points = np.asarray(points).reshape(-1, 3)
     rows = np.empty((len(points), 4), "<f4")
-    rows[:, :3] = points if T_frame_points is None else se3.apply(T_frame_points, points)
+    rows[:, :3] = points
     rows[:, 3] = confidence
     return _cloud_cdr(stamp_ns, frame, CLOUD_FIELDS, rows)
 

@@ -128,7 +128,7 @@ def test_replay_takes_settings_a_rig_and_a_method(scene: Path, start: Path, resu
     coarse = omnid.replay(scene / "log.mcap", rig, config=config)
     assert result.map is not None and coarse.map is not None and len(coarse.map.xyz) < len(result.map.xyz) / 2
     assert np.array_equal(coarse.T_odom_rig, result.T_odom_rig)
-    paper = omnid.replay(start, rig, config=config, method="paper", overrides="log.rate_hz=8")
+    paper = omnid.replay(start, rig, config=config, method="paper", overrides="mapping.rate_hz=8")
     assert len(paper.stamps_ns) == FEW and not np.array_equal(paper.T_odom_rig, result.T_odom_rig[:FEW])
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import struct
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -14,7 +13,6 @@ import cv2
 import numpy as np
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
-from mcap.writer import Writer as McapWriter
 from numpy.typing import NDArray
 from rosbags.convert.converter import migrate_bytes
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -162,22 +160,6 @@ def write_bag(path: Path, entries: Sequence[Entry], compression: str = "", chunk
         }
         for entry in entries:
             writer.write(connections[entry.topic], entry.log_time_ns, ros1_bytes(entry))
-    return path
-
-
-def write_ros1_mcap(path: Path, entries: Sequence[Entry]) -> Path:
-    """Write an MCAP file as it is converted from a bag of ROS 1, with one message of an IMU."""
-    with path.open("wb") as file:
-        writer = McapWriter(file)
-        writer.start("ros1", "test")
-        schema = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", b"")
-        imu = writer.register_channel("/imu", "ros1", writer.register_schema("sensor_msgs/Imu", "ros1msg", b""))
-        channels = {topic: writer.register_channel(topic, "ros1", schema) for topic in {e.topic for e in entries}}
-        for entry in entries:
-            writer.add_message(channels[entry.topic], entry.log_time_ns, ros1_bytes(entry), entry.log_time_ns)
-        rates = struct.pack("<IIII37d", 1, 100, 0, 0, *[0.0] * 13, 0.1, 0.2, 0.3, *[0.0] * 21)
-        writer.add_message(imu, entries[0].log_time_ns, rates, entries[0].log_time_ns)
-        writer.finish()  # type: ignore[no-untyped-call]
     return path
 
 

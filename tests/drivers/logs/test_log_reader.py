@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Camera, Frame, gray
-from drivers.logs.log_reader import WHOLE, LogCameras, LogReader, TimeSource, choose_topics
+from drivers.logs.log_reader import WHOLE, LogCameras, LogReader, MotionTopics, TimeSource, choose_topics
 from drivers.logs.ros_messages import IMAGE_TYPES, IMU, ODOMETRY, parse_image, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from tests.drivers.logs.mcap_logs import (
@@ -37,6 +37,7 @@ from tests.drivers.logs.mcap_logs import (
     jpeg,
     pairs,
     text,
+    write_bag,
     write_log,
 )
 
@@ -218,6 +219,14 @@ def serialised(message: Any, kind: str) -> bytes:
 
 def sample(kind: str, data: bytes) -> MotionSample:
     return parse_motion(kind, memoryview(data))
+
+
+def test_a_bag_of_ros1_has_the_samples_of_its_imu(tmp_path: Path) -> None:
+    rates = Entry("/imu", IMU, imu((0.1, 0.2, 0.3), stamp_ns=START_NS), START_NS)
+    path = write_bag(tmp_path / "log.bag", [rates, *pairs(2)])
+    with closing(LogReader(path, motion=MotionTopics(imu="/imu"))) as reader:
+        samples = [message for message in reader.messages() if not isinstance(message, Frame)]
+    assert samples == [GyroSample(START_NS, 0.1, 0.2, 0.3)]
 
 
 def test_the_rates_are_those_of_the_base() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import subprocess
@@ -19,7 +18,7 @@ from mcap.writer import CompressionType
 from rosbags.highlevel import AnyReader
 
 from drivers.logs.log_reader import LogReader, open_log
-from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotationSettings, is_locked
+from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotationSettings
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, Entry, pairs, text
 
 ROOT = Path(__file__).parents[3]
@@ -73,15 +72,14 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
         each.log.close()
 
 
-def test_a_file_is_locked_until_it_is_complete(bench: Callable[..., Bench]) -> None:
+def test_a_closed_recording_takes_no_more_messages(bench: Callable[..., Bench]) -> None:
     recording = bench()
     recording.write(30)
-    assert is_locked(recording.folder / recording.names()[0])
     recording.log.close()
     recording.log.close()
     recording.write(1)
     (path,) = recording.folder.iterdir()
-    assert path.name == "robot_20231114T221320Z_001.mcap" and counted(path) == 30 and not is_locked(path)
+    assert path.name == "robot_20231114T221320Z_001.mcap" and counted(path) == 30
     assert (recording.state.status, recording.state.messages, recording.state.lost) == ("closed", 31, 1)
 
 
@@ -115,16 +113,6 @@ def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> Non
     assert set(strangers) < set(names) and left_by_a_crash.name not in names
     assert [name[-8:] for name in names if name not in strangers] == ["008.mcap", "009.mcap", "010.mcap"]
     assert recording.state.deleted == 8 and recording.state.lost == 0
-
-
-def test_a_file_that_another_program_writes_is_not_deleted(bench: Callable[..., Bench]) -> None:
-    recording = bench(replace(ROOMY, file_s=1.0, file_bytes=100_000, keep_bytes=140_000))
-    recording.folder.mkdir()
-    written = recording.folder / "robot_20200101T000000Z_001.mcap"
-    with written.open("wb") as file:
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
-        recording.write(200)
-    assert written.exists() and recording.state.deleted == recording.state.files - 2 > 3
 
 
 @pytest.fixture
