@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.mcap_writer import is_locked, lock
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_whole
@@ -26,7 +25,7 @@ REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files t
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
-    """Check that all outputs (option, path) can be written, and none is another one, an input (name, path) or in use.
+    """Check that all outputs (option, path) can be written, and none is another one or an input (name, path).
 
     Leaves no file behind. Raises OmnidError.
     """
@@ -41,8 +40,6 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
         elif (other := used.setdefault(_identity(path), option)) != option:
             wrong = f"this is {other} as well"
-        elif is_locked(path):
-            wrong = "another program is writing it"
         elif not os.access(path if path.exists() else path.parent, os.W_OK):
             wrong = "it may not be written"
         if wrong:
@@ -74,7 +71,6 @@ class TrajectoryFile:
         try:
             if self._file is None:
                 self._file = self._path.open("wb", buffering=0)
-                lock(self._file)
             written = self._file.write(row)
             if written != len(row):
                 self._file.truncate(self._file.tell() - written)  # Remove the part of a row.

@@ -5,17 +5,11 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from drivers.logs.mcap_writer import LogWriter
-from omnid.sinks.files import write_trajectory
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import Entry, text, write_log
 from tests.replay.command import Command, rows
@@ -94,25 +88,6 @@ def test_uses_the_readable_part_of_a_truncated_log(omnid: Command, tmp_path: Pat
     assert code == 0 and err.startswith("omnid: warning: ") and "cut" in err, out
     assert PAIRS // 3 < result.count("pairs") < PAIRS
     assert len(rows(tum)) == result.count("pairs")
-
-
-def test_a_file_that_another_run_writes_is_no_output(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """Two runs with one file would leave a recording that neither can be read from."""
-    mcap, tum = tmp_path / "run.mcap", tmp_path / "run.txt"
-
-    def errors() -> Iterator[str]:
-        for option, path in (("--record", mcap), ("--tum", tum)):
-            yield omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", option, path)
-
-    def poses() -> Iterator[NDArray[np.float64]]:
-        yield np.eye(4)
-        assert all("another program is writing it" in error for error in errors())
-        yield np.eye(4)
-
-    with closing(LogWriter(mcap)):
-        write_trajectory(tum, np.arange(2), poses())  # type: ignore[arg-type]
-    assert len(rows(tum)) == 2 and omnid("log", "info", mcap).code == 0
-    assert omnid.replay(scene / "log.mcap", "--tum", tum, "--seconds", 0.1, rig=scene / "rig.toml").code == 0
 
 
 def test_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Path) -> None:
