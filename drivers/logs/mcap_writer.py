@@ -42,7 +42,7 @@ class LogWriter:
     """Writes a log; a crash loses at most the last chunk, or half a second of stamps.
 
     attachments (name -> bytes) are written first, so that they survive a crash. JPEG images are not made smaller by a
-    compression. An existing file is replaced, unless exclusive.
+    compression. An existing file is replaced.
     Raises DriverError where the file cannot be created or written (a full disk).
 
     messages: number of messages written; persisted: number of those that would survive a crash now; size_bytes: of the
@@ -55,13 +55,12 @@ class LogWriter:
         attachments: Mapping[str, bytes] | None = None,
         *,
         compression: CompressionType = CompressionType.LZ4,
-        exclusive: bool = False,
     ) -> None:
         self._path = Path(path)
         self.messages = self.persisted = self.size_bytes = 0
         self._channels: dict[tuple[str, str], int] = {}
         try:
-            self._file = self._path.open("xb" if exclusive else "wb")
+            self._file = self._path.open("wb")
         except OSError as error:
             raise DriverError(
                 f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
@@ -253,7 +252,7 @@ class RotatingLog:
         at = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9))
         names = (f"{self._name}_{at}_{number:03}.mcap" for number in count(1 + self.state.files))
         self._path = next(path for name in names if not os.path.lexists(path := self._folder / name))
-        self._writer = LogWriter(self._path, self._attachments, compression=CompressionType.NONE, exclusive=True)
+        self._writer = LogWriter(self._path, self._attachments, compression=CompressionType.NONE)
         self._start_ns, self._synced_s = stamp_ns, time.monotonic()
         self.state.files += 1
         self._own[self._path.name] = self.state.files

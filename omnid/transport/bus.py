@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import count
-from operator import attrgetter
 from typing import Any, Final
 
 import zenoh
@@ -152,19 +151,13 @@ class Bus:
         self._open: dict[int, zenoh.Query] = {}  # requests that wait for their answers, by id
         self._answered: deque[tuple[zenoh.Query, Answer]] = deque(maxlen=MOST_OPEN)
         self._stop_listener: StopListener | None = None
-        self._flooded = 0  # floods at the last status
         self._pollers = [Poller(self._answer_queries, PERIOD_S, "bus queries")]
 
     def stats(self) -> dict[str, object]:
         """Return whether the name is unique, and how often others sent too much."""
         rings = [*self._rings, *self._queries.values()]
-        before, self._flooded = self._flooded, sum(ring.floods for ring in rings)
-        most = max(rings, key=attrgetter("floods"), default=None)
-        return {
-            "same_name": len(self._namesakes),  # other robots of this name
-            "floods": self._flooded,  # how often a key had more messages than its budget
-            "flooded": most.key if most and self._flooded > before else "",
-        }
+        # floods: how often a key had more messages than its budget
+        return {"same_name": len(self._namesakes), "floods": sum(ring.floods for ring in rings)}
 
     @property
     def is_unique(self) -> bool:

@@ -121,9 +121,6 @@ WORDS: Final[Mapping[str, Mapping[int, Callable[[Stats], object]]]] = {
     },
     BUS: {
         ERROR: lambda stats: stats["same_name"] and SAME_NAME,
-        WARN: lambda stats: (
-            stats["flooded"] and f"more messages on {stats['flooded']} than are taken: end their sender"
-        ),
         OK: lambda _: "open",
     },
     CLOCK: {OK: lambda stats: f"set by {stats['step_s']:+.3f} s: the stamps follow" if stats["steps"] else "followed"},
