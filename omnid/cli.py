@@ -35,7 +35,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
         "calibrate:import_rig",
         "a rig.toml from files of other programs, or of two 360-degree cameras",
     ),
-    "cameras": ("machine:show_cameras", "list cameras and the udev rule to copy, or show what they see"),
+    "cameras": ("machine:show_cameras", "list cameras and the names of their ports, or show what they see"),
     "arm": ("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
     "stop": ("robot:stop", "stop the wheels until `omnid arm`; everyone who can connect may"),
     "drive": ("robot:drive", "drive a robot by the keyboard"),

@@ -9,7 +9,7 @@ import errno
 import mmap
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -206,7 +206,6 @@ def _set_exposure(fd: int, setting: ExposureSetting) -> None:
         _write(fd, control_id, value)
 
 
-RULES_FILE: Final = "/etc/udev/rules.d/70-omnid-cameras.rules"  # ID_PATH is set by 60-persistent-v4l.rules
 # V4L2's fourcc -> the name in a Frame, in the order of preference: no decoding first, then fewer bytes
 ENCODINGS: Final = {"GREY": "mono8", "NV12": "nv12", "YUYV": "yuyv", "UYVY": "uyvy", "MJPG": "jpeg", "JPEG": "jpeg"}
 _BUFFERS: Final = 4  # v4l2loopback needs exactly this number
@@ -401,17 +400,6 @@ def capture_devices(root: Path = Path("/")) -> list[CaptureDevice]:
     nodes = sorted((root / "sys/class/video4linux").glob("video*"), key=lambda path: (len(path.name), path.name))
     found = [_device(root, path) for path in nodes if (path / "index").read_text("utf-8").strip() == "0"]
     return [device for device in found if device is not None]
-
-
-def udev_rules(devices: Iterable[CaptureDevice]) -> Iterator[str]:
-    """Yield a udev rule for each of the first two devices with a known port: /dev/omnid/lower and upper.
-
-    Devices are matched by port, since two cameras of one model may differ in nothing else.
-    """
-    for device, camera in zip([one for one in devices if one.by_path], ("lower", "upper"), strict=False):
-        # udev's ID_PATH is a part of the link's name (60-persistent-v4l.rules).
-        id_path = re.sub(r"-video-index\d+$", "", device.by_path.rpartition("/")[2])
-        yield f'SUBSYSTEM=="video4linux", ATTR{{index}}=="0", ENV{{ID_PATH}}=="{id_path}", SYMLINK+="omnid/{camera}"'
 
 
 def _device(root: Path, entry: Path) -> CaptureDevice | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from calib.atomic_file import write_file
 from calib.rig_file import png
 from drivers.cameras.v4l2_camera import V4l2Camera
-from drivers.cameras.v4l2_device import RULES_FILE, V4l2Settings, capture_devices, udev_rules
+from drivers.cameras.v4l2_device import V4l2Settings, capture_devices
 from drivers.frame import CAMERAS as SIDES
 from drivers.frame import Camera, gray
 from drivers.motors.serial_motor import motor_protocol
@@ -129,16 +129,9 @@ def doctor(args: argparse.Namespace) -> int:
     return int(counts["error"] > 0)
 
 
-_ADVICE = """
-To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are plugged in, put this into {file}
-(exchange lower and upper if they are the other way round), then run
-`udevadm control --reload && udevadm trigger --subsystem-match=video4linux`:
-"""
-
-
 @options.command(options.SETTINGS)
 def show_cameras(args: argparse.Namespace) -> int:
-    """List cameras and the udev rule to copy.
+    """List cameras and the persistent names of their ports.
 
     With --snapshot write an image of each configured camera with the mirror's rim, and print a measure of its focus,
     which is highest where the lens is set best. Exit code 1: there is no camera.
@@ -159,8 +152,7 @@ def show_cameras(args: argparse.Namespace) -> int:
         for line in filter(None, (device.by_path, device.problem)):
             print(f"  {line}")
     print(f"\nThe modes of a camera: v4l2-ctl -d {devices[0].node} --list-formats-ext")
-    if rules := list(udev_rules(devices)):
-        print(_ADVICE.format(file=RULES_FILE), *rules, sep="\n")
+    print("Set cameras.lower and cameras.upper to names by-path, or enter these ports in udev/rules.d/90-omnid.rules")
     return 0
 
 

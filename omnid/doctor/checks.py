@@ -51,7 +51,7 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
         subject, path = f"camera {name}", names[name]
         device = nodes.get(path.resolve())
         if not path.exists():
-            connect = "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name"
+            connect = "connect the camera; `omnid cameras` lists the cameras and the names of their ports"
             yield Finding("error", subject, f"{settings.device} does not exist", connect)
         elif device is None:
             yield Finding("error", subject, f"{settings.device} is no camera", "choose one of `omnid cameras`")

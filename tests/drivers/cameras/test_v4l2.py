@@ -31,7 +31,6 @@ from drivers.cameras.v4l2_device import (
     exposure_ranges,
     follow_request,
     set_controls,
-    udev_rules,
 )
 from drivers.cameras.v4l2_ioctl import BufferFlag
 from drivers.errors import DriverError
@@ -120,13 +119,6 @@ def test_finds_cameras_by_number_without_metadata_nodes(two_webcams: Path) -> No
     assert "is not a video device" in first.problem and "is not there" in second.problem
 
 
-def test_rules_match_the_ports(two_webcams: Path) -> None:
-    rules = list(udev_rules(capture_devices(two_webcams)))
-    expected = f'SUBSYSTEM=="video4linux", ATTR{{index}}=="0", ENV{{ID_PATH}}=="{PORT}", SYMLINK+="omnid/lower"'
-    assert rules[0] == expected
-    assert 'usb-0:2:1.0", SYMLINK+="omnid/upper"' in rules[1] and len(rules) == 2
-
-
 def test_the_command_lists_the_cameras(
     two_webcams: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -136,7 +128,7 @@ def test_the_command_lists_the_cameras(
     printed = capsys.readouterr().out
     assert "/dev/video2  HD Webcam\n" in printed
     assert "v4l2-ctl -d /dev/video2 --list-formats-ext" in printed
-    assert "/etc/udev/rules.d/" in printed and "omnid/upper" in printed
+    assert f"/dev/v4l/by-path/{PORT}-video-index0" in printed and "90-omnid.rules" in printed
     monkeypatch.setattr(machine, "ROOT", two_webcams / "none")
     assert main(["cameras"]) == 1
     missing = capsys.readouterr()

@@ -22,7 +22,7 @@ import pytest
 
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.v4l2_camera import V4l2Camera
-from drivers.cameras.v4l2_device import RULES_FILE, V4l2Settings, capture_devices, udev_rules
+from drivers.cameras.v4l2_device import V4l2Settings
 from drivers.frame import Frame, gray
 from tests.hardware.guest.surroundings import DEVICES, Loopback, load_loopback
 
@@ -139,13 +139,12 @@ class Writer:
 
 @pytest.fixture(scope="session")
 def rules() -> Path:
-    """The rules that name the two cameras, as `omnid cameras` prints them, installed."""
-    path = Path("/run/udev/rules.d", Path(RULES_FILE).name)
+    """The rules that name the two cameras, installed."""
+    path = Path("/run/udev/rules.d/70-cameras.rules")
     run("modprobe", "vivid", "n_devs=2", "node_types=0x1,0x1")
     run("udevadm", "settle")
     printed = run("python3", "-m", "omnid", "cameras")
-    assert all(rule in printed for rule in udev_rules(capture_devices()))
-    # Both are at one port of the kernel's, so that the printed rule cannot tell them apart.
+    # Both are at one port of the kernel's, so that a rule for ports cannot tell them apart.
     names = zip(("vivid-000-vid-cap", "vivid-001-vid-cap"), (LOWER, UPPER), strict=True)
     found = [f'SUBSYSTEM=="video4linux", ATTR{{name}}=="{name}", SYMLINK+="{link[5:]}"' for name, link in names]
     assert "vivid-001-vid-cap" in printed and "--list-formats-ext" in printed
