@@ -40,8 +40,6 @@ from omnid.transport.topics import PANORAMA, SCAN
 if TYPE_CHECKING:  # it imports rerun, which may be missing
     from omnid.viewer.rerun_sink import RerunSink
 
-BROKEN = "cut or corrupt"
-
 
 @options.command()
 def info(args: argparse.Namespace) -> int:
@@ -66,7 +64,7 @@ def info(args: argparse.Namespace) -> int:
         print("\n" * bool(number), end="")
         with closing(log):
             _show(log)
-        code = max(code, int(log.state == BROKEN))
+        code = max(code, int(bool(log.cut or log.faults)))
     return code
 
 

@@ -30,6 +30,7 @@ from msgspec.structs import asdict
 from calib import se3
 from calib.models.camera import Array
 from calib.typed_toml import bytes_of, convert, table_of
+from calib.validation import MAX_FILE_BYTES
 from drivers.motors.simulated_motor import Pose
 from omnid.errors import OmnidError
 from omnid.simulation.rendering import surfaces
@@ -181,7 +182,6 @@ def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) ->
 
 # World files.
 
-MAX_BYTES: Final = 1 << 18  # which also bounds the numbers of things
 PX_PER_M, FLOOR_PX_PER_M = 200.0, 120.0  # Textures of walls, and of floor and ceiling.
 KINDS: Final = ("brick", "plaster", "granite", "plaster")  # Textures of a random wall.
 Side: TypeAlias = Annotated[float, Meta(ge=0.02, le=20.0)]  # m
@@ -283,7 +283,7 @@ def load_world(name: str, seed: int = 0) -> World:
         if name in shipped_worlds():
             data = (files("omnid.simulation.worlds") / f"{name}.toml").read_bytes()
         elif name.endswith(".toml"):
-            data = bytes_of(name, MAX_BYTES)
+            data = bytes_of(name, MAX_FILE_BYTES)
         else:
             raise OmnidError(
                 f"world {name!r} is not known; name a file *.toml, or one of {', '.join(shipped_worlds())}"
