@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models.camera import Array
@@ -129,21 +128,6 @@ class BoardView:
 
     name: str
     pixels: Array
-
-
-def ambiguous_orders(board: AnyBoard) -> list[NDArray[np.intp]]:
-    """Return the orders (N,) of the corners that one image of a board cannot distinguish; the first is the identity.
-
-    If one side is odd and one even, the colours determine the order. Otherwise a rotation by 180 degrees is ambiguous,
-    and for a square board with even sides every rotation by 90 degrees. Markers leave no ambiguity.
-    """
-    if not isinstance(board, Board):
-        return [np.arange(len(board.points))]
-    grid = np.arange(board.columns * board.rows).reshape(board.rows, board.columns)
-    if (board.columns + board.rows) % 2:
-        return [grid.ravel()]
-    quarters = range(4) if board.columns == board.rows and board.columns % 2 == 0 else (0, 2)
-    return [np.rot90(grid, quarter).ravel() for quarter in quarters]
 
 
 MODE_NAMES = ("bend_x", "bend_y", "twist", "stretch")

@@ -17,11 +17,14 @@ from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
 Progress = Callable[[str], None]  # receives the lines that a long calibration reports while it runs
-CORNERS_HINT = "count the inner corners, and take images with the whole board in view, sharp and well lit"
-TAGS_HINT = (
-    "check --tags and --tag-spacing, and take images with the board nearer (six pixels a bit of its tags), sharp and "
-    "well lit"
-)
+
+
+def require_one_orientation(board: AnyBoard) -> None:
+    """Raise OmnidError for a checkerboard of which two cameras may not see the same side up."""
+    if isinstance(board, Board) and (board.columns + board.rows) % 2 == 0:
+        raise OmnidError(
+            f"calibrate: a {board} looks the same upside down: take one with an odd and an even number of corners"
+        )
 
 
 def search_board(image: Image, board: AnyBoard, name: str = "") -> BoardView | None:
@@ -42,8 +45,10 @@ def find_boards(images: Images, board: AnyBoard, progress: Progress = silent) ->
                 outcome = f"board found, {np.isfinite(corners).sum()} of {len(corners)} corners"
             progress(f"[{number}/{len(images)}] {name}: {outcome}")
     if not views:
-        hint = CORNERS_HINT if isinstance(board, Board) else TAGS_HINT
-        raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
+        raise OmnidError(
+            f"calibrate: no {board} in any of {len(images)} images; check the options of the board, and take images "
+            "with the whole board in view, near, sharp and well lit"
+        )
     return views
 
 

@@ -23,6 +23,7 @@ from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import (
     Progress,
     find_boards,
+    require_one_orientation,
     view_of_tags,
 )
 from omnid.calibration.images import PairedImages, brightest, read_pairs
@@ -94,6 +95,7 @@ def calibrate_rig(
     image and each fit. Raises OmnidError or CalibError where the images do not suffice.
     """
     # 1. Read the images, each once.
+    require_one_orientation(board)
     if view is None and isinstance(board, Board):
         raise OmnidError(
             "calibrate: a checkerboard looks the same in a mirror and through a lens: add --view mirror or direct"

@@ -21,6 +21,7 @@ from calib.rig import Rig
 from calib.rig_file import png, read_rig, write_rig
 from calib.validation import read_text, silent
 from drivers.logs.log_reader import LogCameras, LogReader
+from omnid.calibration.board_search import require_one_orientation
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
 from omnid.calibration.images import SIDES, read_pairs
@@ -61,7 +62,9 @@ def board_of(args: argparse.Namespace) -> AnyBoard:
         columns, rows = args.tags
         return AprilGrid(columns, rows, args.tag_mm / 1e3, args.tag_spacing)
     columns, rows = args.corners
-    return Board(columns, rows, args.square_mm / 1e3)
+    board = Board(columns, rows, args.square_mm / 1e3)
+    require_one_orientation(board)
+    return board
 
 
 @options.command(BOARD, options.LOG_CAMERAS, options.HEIGHT, options.QUIET)

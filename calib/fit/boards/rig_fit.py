@@ -114,7 +114,7 @@ def calibrate_boards(
 
     sizes: (width, height) [px] of each camera's images. images: those of each camera by the views' names, in which the
     corners are refined by the calibrated cameras; none: they stay. CalibError where fewer than MIN_VIEWS views of a
-    camera, or pairs of both, are consistent, or where the order of the board's corners is ambiguous.
+    camera, or pairs of both, are consistent.
     """
     # 1. Each camera by its own views: a linear solution, then the most likely camera. What fits neither is left out.
     views, rejected, alone = list(views), list[RejectedView](), list[RigCalibration]()
@@ -214,13 +214,9 @@ def _fit_pair(views: Sequence[PairView], board: AnyBoard, alone: Sequence[RigCal
     lower, upper = (
         {numbers[view.name]: T for view, T in zip(one.views, one.fit.rig.T_lower_board, strict=True)} for one in alone
     )
-    initial = initialise_relative_pose(lower, upper, board)
+    initial = initialise_relative_pose(lower, upper)
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
     good = [views[k] for k in initial.T_lower_board]
-    for at, k in enumerate(initial.T_lower_board):
-        seen = good[at].seen[1]
-        if seen is not None and k in initial.orders:
-            good[at] = _with(good[at], 1, replace(seen, pixels=seen.pixels[initial.orders[k]]))
     _require(_pairs(good), "consistent pairs of views", rejected)
     shape = PrintShape(tuple(np.mean([one.shape.values for one in alone], axis=0).tolist()))
     start = BoardRig(cameras, initial.T_upper_lower, np.array([*initial.T_lower_board.values()]), shape, np.zeros(2))

@@ -1,8 +1,7 @@
 """Start values of a calibration by boards: a camera and poses by a linear solution, then the transform of two cameras.
 
 The linear solution is that of Scaramuzza, Martinelli and Siegwart 2006, section IV. Its frame is the toolbox's: x down
-the rows, y along the columns, rays (x, y, f(rho)). The transform is that of the most pairs. The order of a board's
-corners may be ambiguous in one image; the consensus decides it for every pair.
+the rows, y along the columns, rays (x, y, f(rho)). The transform is that of the most pairs.
 """
 
 from __future__ import annotations
@@ -12,10 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import AnyBoard, ambiguous_orders
 from calib.errors import CalibError
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
@@ -140,31 +137,20 @@ class RelativePoseInitialisation:
 
     T_upper_lower: Array  # (4, 4)
     T_lower_board: dict[int, Array]  # (4, 4) by view
-    orders: dict[int, NDArray[np.intp]]  # (N,) of the upper corners, by pair
     rejected: tuple[tuple[int, str], ...]  # view and reason
 
 
-def initialise_relative_pose(
-    lower: Mapping[int, Array], upper: Mapping[int, Array], board: AnyBoard
-) -> RelativePoseInitialisation:
-    """Find the transform with the most consistent pairs, by the board's poses (4, 4) in front of each camera, by view.
-
-    Raises CalibError if the order of the corners is ambiguous.
-    """
-    # 1. The transform by each pair of views, for every possible order of the upper corners.
-    orders = ambiguous_orders(board)
-    turns = [_turn_of(board.points, order) for order in orders]
+def initialise_relative_pose(lower: Mapping[int, Array], upper: Mapping[int, Array]) -> RelativePoseInitialisation:
+    """Find the transform with the most consistent pairs, by poses (4, 4) of the board in front of each camera."""
+    # 1. The transform by each pair of views.
     both = sorted(lower.keys() & upper.keys())
-    candidates = np.array([[upper[k] @ turn @ se3.inverse(lower[k]) for turn in turns] for k in both])
     # 2. Consensus of the transforms of all pairs.
-    best, apart = _consensus(candidates)
-    gap = apart.min(axis=1)
+    best, gap = _consensus(np.array([upper[k] @ se3.inverse(lower[k]) for k in both]))
     limit = float(np.clip(INLIER_RATIO * np.median(gap), MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE))
     outliers = {k: float(gap[i]) for i, k in enumerate(both) if gap[i] > limit}
     # 3. The pose of the board in the lower camera's frame, for each view that is left. Outlier pairs are rejected.
     placed = {k: se3.inverse(best) @ T for k, T in upper.items() if k not in lower}
     placed |= {k: T for k, T in lower.items() if k not in outliers}
-    orders_of = {k: orders[int(apart[i].argmin())] for i, k in enumerate(both) if k not in outliers}
     rejected = tuple(
         (
             k,
@@ -173,16 +159,7 @@ def initialise_relative_pose(
         )
         for k, distance in outliers.items()
     )
-    return RelativePoseInitialisation(best, dict(sorted(placed.items())), orders_of, rejected)
-
-
-def _turn_of(points: Array, order: NDArray[np.intp]) -> Array:
-    """Return the transform (4, 4) of the board onto itself that moves each point (N, 3) to that of another order."""
-    middle = points.mean(axis=0)
-    left, _, right = np.linalg.svd((points[order] - middle)[:, :2].T @ (points - middle)[:, :2])
-    R = np.eye(3)
-    R[:2, :2] = left @ right
-    return se3.transform(R, middle - R @ middle)
+    return RelativePoseInitialisation(best, dict(sorted(placed.items())), rejected)
 
 
 def pose_of_columns(columns: Array) -> Array:
@@ -193,23 +170,12 @@ def pose_of_columns(columns: Array) -> Array:
 
 
 def _consensus(candidates: Array) -> tuple[Array, Array]:
-    """Return the candidate (4, 4) of (K, S, 4, 4) with the most support, and the distances (K, S) of all from it."""
-    flat = candidates.reshape(-1, 4, 4)
-    # The distances (K S, K, S) of all from each: angle [rad] plus shift as a fraction of the length of the translation.
-    R, t = se3.R_of(flat), se3.t_of(flat)
+    """Return the candidate (4, 4) of (K, 4, 4) with the most support, and the distances (K,) of all from it."""
+    # The distances (K, K) of all from each: angle [rad] plus shift as a fraction of the length of the translation.
+    R, t = se3.R_of(candidates), se3.t_of(candidates)
     gaps = se3.rotation_log(np.swapaxes(R, -1, -2) @ R[:, None])
     length = np.maximum(np.linalg.norm(t, axis=-1), np.finfo(float).tiny)[:, None]
-    distances = np.linalg.norm(gaps, axis=-1) + np.linalg.norm(t - t[:, None], axis=-1) / length
-    apart = distances.reshape(-1, *candidates.shape[:2])
-    nearest = apart.min(axis=2)
+    apart = np.linalg.norm(gaps, axis=-1) + np.linalg.norm(t - t[:, None], axis=-1) / length
     # All outliers have the same cost: MSAC (Torr and Zisserman 2000).
-    cost = np.minimum(nearest, MAX_INLIER_DISTANCE).mean(axis=1)
-    best = int(cost.argmin())
-    others = cost[apart[best].ravel() > MAX_INLIER_DISTANCE]
-    # The order of corners is ambiguous if a transform farther away than any inlier fits nearly as well.
-    if candidates.shape[1] > 1 and others.size and others.min() < max(INLIER_RATIO * cost[best], MIN_INLIER_DISTANCE):
-        raise CalibError(
-            "calibrate rig: a board with two even or two odd sides looks the same upside down, and its orientation is "
-            "ambiguous in these pairs; hold it at more places, or use a board with one odd and one even side"
-        )
-    return flat[best], apart[best]
+    best = int(np.minimum(apart, MAX_INLIER_DISTANCE).mean(axis=1).argmin())
+    return candidates[best], apart[best]

@@ -141,6 +141,7 @@ def test_images_without_a_board_are_one_line_and_exit_code_2(
     [
         (["--corners", "6x5"], "--board checkerboard: expected --corners, --square-mm"),
         (["--corners", "6x5", "--square-mm", "30"], "add --view mirror or direct"),
+        (["--corners", "8x6", "--square-mm", "30"], "looks the same upside down"),
         (["--board", "aprilgrid", "--tags", "6x6", "--tag-mm", "80", "--tag-spacing", "24"], "Kalibr's tagSpacing"),
     ],
 )

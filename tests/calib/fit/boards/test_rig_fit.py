@@ -1,4 +1,4 @@
-"""Calibration by corners: one camera and rigs, sigmas, bent boards, real mirrors, ambiguous and inconsistent views."""
+"""Calibration by corners: one camera and rigs, sigmas, bent boards, real mirrors, inconsistent views."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape, ambiguous_orders
+from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape
 from calib.boards.checkerboard import find_board
 from calib.errors import CalibError
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards
@@ -35,7 +35,7 @@ RIG = Rig(
 # Frames of unified cameras have x against u, those of ocam cameras x down the rows.
 T_OMNI_OCAM = se3.transform(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
 T_TRUE = se3.inverse(T_OMNI_OCAM) @ T_UPPER_LOWER @ T_OMNI_OCAM
-ODD, EVEN, SQUARE = Board(7, 6, 0.03), Board(8, 6, 0.03), Board(6, 6, 0.03)
+ODD = Board(7, 6, 0.03)
 OCAM = OcamCamera((-131.6, 0.0, 1.9e-3, 0.0, -6e-10), (380.9, 394.2), (0.998, 2e-4, 2e-4), SIZE)
 DIRECT = OcamCamera((-190.0, 0.0, 1.2e-3, 0.0, 4e-10), (380.9, 394.2), (1.001, -3e-4, -3e-4), SIZE, "direct")
 PINHOLE = UnifiedCamera(0.0, (400.0, 401.5), (394.2, 380.9), SIZE)
@@ -62,16 +62,8 @@ def off(found: RigCalibration) -> tuple[float, float]:
     return float(np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3])))), float(1e3 * np.linalg.norm(gap[:3, 3]))
 
 
-@pytest.mark.parametrize("board", [EVEN, SQUARE])
-def test_recovers_the_rig_for_every_orientation_of_the_boards(board: Board) -> None:
-    orders = ambiguous_orders(board)
-    assert len(orders) == {EVEN: 2, SQUARE: 4}[board]
-    views = []
-    for k, view in enumerate(pairs(board)):
-        lower, upper = view.seen
-        assert upper
-        views.append(replace(view, seen=(lower, replace(upper, pixels=upper.pixels[orders[k % len(orders)]]))))
-    found = calibrated(views, board)
+def test_recovers_the_rig() -> None:
+    found = calibrated(pairs(ODD))
     assert off(found)[0] < 0.01 and off(found)[1] < 0.15 and found.pairs == 10 and found.rejected == ()
     assert found.cameras[0].center == pytest.approx(LOWER.center, abs=0.01)
 
