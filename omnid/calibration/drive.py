@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -10,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.fit.least_squares import ROUNDS
 from calib.fit.parameters import TIMES, RigParameters
 from calib.fit.rig_drift import apply_drift
@@ -31,27 +31,21 @@ from omnid.calibration.drive_observations import Drives, collect
 from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.rig.rig_health import SIGMAS
-from omnid.core.stereo.triangulation import common_perpendicular
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
 
-# Error of the landmarks with the new rig, as a fraction of that with the old one. Free parameters always lower the
-# error a little, so a smaller gain does not show a better rig.
-SMALL_GAIN = 0.95
 # Distortion terms of omni cameras that are fitted although the file has none: a camera may be tilted below its mirror.
 DISTORTION = ("p1", "p2")
 
 
 @dataclass(frozen=True, slots=True)
 class DriveCalibration:
-    """The rig that fits the drives, and the one before."""
+    """The rig that fits the drives."""
 
-    before: Rig
     rig: Rig  # with its covariance
     adjustment: DriveAdjustment
     first_sigma_px: float  # of an observation with the rig as it was
-    scale_change: float  # relative change of lengths against the rig before
     drives: Drives
 
     def __str__(self) -> str:
@@ -59,14 +53,15 @@ class DriveCalibration:
         return (
             f"{self.drives.keyframes} keyframes, {len(adjustment.state.points)} landmarks, "
             f"{len(adjustment.observations)} observations; error {self.first_sigma_px:.3f} px before, "
-            f"{adjustment.sigma_px:.3f} px after, lengths change by {100 * self.scale_change:+.3f} %"
-            + (f"; drives: {uncertainty}" if uncertainty else "")
+            f"{adjustment.sigma_px:.3f} px after" + (f"; drives: {uncertainty}" if uncertainty else "")
         )
 
     @property
     def is_better(self) -> bool:
-        """True if the landmarks fit better than with the rig before by more than further parameters always bring."""
-        return self.adjustment.sigma_px <= SMALL_GAIN * self.first_sigma_px
+        """True if the log-likelihood has risen by more than one for each parameter (Akaike 1974)."""
+        found = self.adjustment
+        independent = 2 * len(found.observations) / CORRELATED_OBSERVATIONS
+        return independent * math.log(self.first_sigma_px / found.sigma_px) > len(found.parameters.names)
 
 
 def calibrate_drive(
@@ -90,23 +85,24 @@ def calibrate_drive(
     waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
     parameters = RigParameters.about(before, DISTORTION, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
-    start = straightened(paths[0], parameters, cameras, config, progress)
-    require_same_rig(parameters, start)
-    # 3. Track and adjust in rounds, until lengths change no more.
-    found, drives = _in_rounds(paths, parameters, start, cameras, config, progress)
+    steps = straightened(paths[0], parameters, cameras, config, progress)
+    require_same_rig(parameters, steps)
+    # 3. Track and adjust: each round tracks in panoramas of the rig of the one before.
+    correlated = 1.0 if before.covariance is None else CORRELATED_OBSERVATIONS
+    for number in range(ROUNDS):
+        drives = collect(paths, parameters.at(steps), cameras, config)
+        tracked = replace(drives.state, steps=steps)
+        found = adjust_drive(parameters, tracked, drives.observations, drives.fixed, correlated=correlated)
+        steps = found.state.steps
+        progress(
+            f"round {number + 1}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
+            f"{found.sigma_px:.3f} px"
+        )
     # 4. Refuse what is another rig.
-    require_same_rig(parameters, found.state.steps)
+    require_same_rig(parameters, steps)
     # 5. The length of the baseline by the prior, and the covariance.
-    adjusted = _finished_rig(before, found)
-    return DriveCalibration(
-        before,
-        adjusted,
-        found,
-        observation_sigma(before, found, drives.fixed),
-        # By the rays of the adjustment, and by the length of the baseline.
-        scale_change(found, before) + float(np.log(adjusted.baseline_m / before.baseline_m)),
-        drives,
-    )
+    first_sigma_px = observation_sigma(before, found, drives.fixed)
+    return DriveCalibration(_finished_rig(before, found), found, first_sigma_px, drives)
 
 
 def straightened(
@@ -126,40 +122,6 @@ def straightened(
     return parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
 
 
-def _in_rounds(
-    logs: Sequence[Path],
-    parameters: RigParameters,
-    steps: Array,
-    cameras: LogCameras,
-    config: Config,
-    progress: Progress,
-) -> tuple[DriveAdjustment, Drives]:
-    """Track and adjust until lengths change no more: each round tracks in panoramas of the rig of the one before.
-
-    steps (P,): of the parameters, to start from.
-    """
-    rig = parameters.at(steps)
-    for number in range(1, ROUNDS + 2):
-        drives = collect(logs, rig, cameras, config)
-        found = adjust_drive(
-            parameters,
-            replace(drives.state, steps=steps),
-            drives.observations,
-            drives.fixed,
-            correlated=1.0 if parameters.rig.covariance is None else CORRELATED_OBSERVATIONS,
-        )
-        moved = scale_change(found, rig)
-        steps, rig = found.state.steps, found.rig
-        progress(
-            f"round {number}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
-            f"{found.sigma_px:.3f} px, lengths {100 * moved:+.3f} %"
-        )
-        uncertainty = drive_uncertainty(_finished_rig(parameters.rig, found))
-        if number > 1 and uncertainty is not None and abs(moved) < uncertainty.scale / 2:
-            break
-    return found, drives
-
-
 def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:
     """Return the rig with the length of its baseline and its covariance."""
     parameters = found.parameters
@@ -169,26 +131,6 @@ def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:
     baseline_m, matrix = parameters.baseline(change, covariance)
     rig = found.rig.with_upper_moved(np.zeros(3), np.zeros(2), baseline_m - before.baseline_m)
     return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))
-
-
-def scale_change(found: DriveAdjustment, before: Rig) -> float:
-    """Return the relative change of lengths from the rig before to the adjusted one, for the same pixels."""
-    # The pixels of landmarks that both cameras saw at once.
-    seen = found.observations
-    key = seen.keyframe * (seen.landmark.max() + 1) + seen.landmark
-    sides = [seen.camera == side for side in (0, 1)]
-    _, *common = np.intersect1d(key[sides[0]], key[sides[1]], return_indices=True)
-    pixels = [seen.pixels[side][at] for side, at in zip(sides, common, strict=True)]
-    ranges, old = _ranges(found.rig, pixels), _ranges(before, pixels)
-    known = np.isfinite(ranges) & np.isfinite(old)
-    return float(np.average(np.log(ranges[known] / old[known]), weights=ranges[known] ** -2)) if known.any() else np.nan
-
-
-def _ranges(rig: Rig, pixels: Sequence[Array]) -> Array:
-    """Return the distances (N,) from the lower viewpoint of points at pixels (N, 2) of both cameras."""
-    rays = [m.camera.lift(p) @ se3.R_of(m.T_cam_rig) for m, p in zip((rig.lower, rig.upper), pixels, strict=True)]
-    points = common_perpendicular(rays[0], rays[1], rig.upper.viewpoint - rig.lower.viewpoint)
-    return np.asarray(np.linalg.norm(points, axis=1))
 
 
 def require_same_rig(parameters: RigParameters, steps: Array) -> None:

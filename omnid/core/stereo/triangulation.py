@@ -1,4 +1,4 @@
-"""Triangulation: points from two bearings by the common perpendicular of both rays, and their covariance."""
+"""Triangulation: points from the rows of both panoramas, and their covariance."""
 
 from __future__ import annotations
 
@@ -13,29 +13,11 @@ Array = NDArray[np.float64]
 MIN_DISPARITY_RAD = 1e-7
 
 
-def common_perpendicular(lower_rays: Array, upper_rays: Array, upper_origin: Array) -> Array:
-    """Return midpoints (N, 3) of the common perpendiculars of two bundles of rays; NaN where they diverge.
-
-    lower_rays, upper_rays (N, 3) any length, the lower ones from the origin, the upper ones from upper_origin (3,);
-    parallel rays give NaN as well.
-    Solves V1 = lambda n1, V2 = mu n2 + B for the closest lambda, mu: Dang et al. 2012, eq. (2) to (5). Equations (4)
-    and (5) are damaged in print; this is the closed form of the same problem.
-    """
-    normal = np.cross(lower_rays, upper_rays)
-    squared = (normal**2).sum(axis=1)
-    squared = np.where(squared > MIN_DISPARITY_RAD**2, squared, np.nan)
-    along_lower = (np.cross(upper_origin, upper_rays) * normal).sum(axis=1) / squared
-    along_upper = (np.cross(upper_origin, lower_rays) * normal).sum(axis=1) / squared
-    middle = (along_lower[:, None] * lower_rays + along_upper[:, None] * upper_rays + upper_origin) / 2
-    in_front = (along_lower > 0) & (along_upper > 0)
-    return np.where(in_front[:, None], middle, np.nan)
-
-
 def triangulate(views: Array, cylinder: Cylinder, baseline_m: float) -> Array:
     """Return points (N, 3) [m] in the rectified frame of views (N, 3) = (column, row in lower, row in upper) [px].
 
-    Both rays of a view lie in one plane through the axis, so that they meet: at r = f t / disparity. NaN for rays that
-    are parallel or diverge.
+    Both rays of a view lie in one plane through the axis, so that they meet: at r = f t / disparity, the solution of
+    Dang et al. 2012, eq. (2) to (5). NaN for rays that are parallel or diverge.
     """
     disparity = views[:, 2] - views[:, 1]
     disparity = np.where(disparity > MIN_DISPARITY_RAD * cylinder.focal_px, disparity, np.nan)
