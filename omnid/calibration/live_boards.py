@@ -15,41 +15,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.boards.board import AnyBoard, BoardView
-from calib.models.camera import Array, Mask
-from calib.rim import find_rim
+from calib.models.camera import Array
 from drivers.errors import FrameDecodeError
 from drivers.frame import FrameSource, gray
 from omnid.calibration.board_search import search_board
-from omnid.calibration.images import SIDES, Image, middle_px
+from omnid.calibration.images import SIDES, Image
 from omnid.errors import OmnidError
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import CALIBRATION, Key, entry
 
 HOURS: Final = 12  # sectors; hour 12 is the top of the image
-RINGS: Final = 3  # Number of rings of equal width from the hub to the rim.
+RINGS: Final = 3  # Number of rings of equal width in the largest disc of the image.
 NEEDED_PAIRS: Final = 15
-NEEDED_RINGS: Final = 2  # Rings that need boards at half of the hours: boards that both cameras see reach no more.
-# Two positions of a board differ if their corners are this far apart on average, as a fraction of the rim's radius.
+# Two positions of a board differ if their corners are this far apart on average, as a fraction of the disc's radius.
 NEW_VIEW_PART: Final = 0.06
 STILL_PART: Final = 0.004  # a board that is held still moves less between two images
 Views = tuple[BoardView | None, BoardView | None]
 
 
-@dataclass
+@dataclass(frozen=True, slots=True)
 class CameraCoverage:
-    """Views of one camera; rim: the ring of the image that shows the world."""
+    """Views of one camera with images of a shape (H, W): in the largest disc of these."""
 
-    rim: Mask
+    shape: tuple[int, ...]
     views: list[Array] = field(default_factory=list)  # (N, 2) px each, finite
+
+    @property
+    def radius_px(self) -> float:
+        """Return the radius of the disc."""
+        return min(self.shape) / 2
 
     def counts(self) -> NDArray[np.int64]:
         """Return the number of views (RINGS, HOURS) that have a corner there; hour 0 is at 12 o'clock."""
         total = np.zeros((RINGS, HOURS), np.int64)
         for pixels in self.views:
             seen = np.zeros((RINGS, HOURS), bool)
-            offset = pixels - self.rim.center
-            ring = (np.hypot(*offset.T) - self.rim.inner_px) / (self.rim.outer_px - self.rim.inner_px)
-            seen[np.clip((ring * RINGS).astype(int), 0, RINGS - 1), hours_of(offset)] = True
+            offset = pixels - np.array(self.shape[::-1]) / 2
+            ring = (np.hypot(*offset.T) / self.radius_px * RINGS).astype(int)
+            seen[np.minimum(ring, RINGS - 1), hours_of(offset)] = True
             total += seen
         return total
 
@@ -58,8 +61,8 @@ class CameraCoverage:
         counts = self.counts()
         hours = [int(hour) or HOURS for hour in np.flatnonzero(counts.sum(axis=0) == 0)]
         found = [f"no board at {', '.join(map(str, sorted(hours)))} o'clock"] if hours else []
-        rings = int((np.count_nonzero(counts, axis=1) >= HOURS // 2).sum())
-        if rings < NEEDED_RINGS:
+        # Two rings need boards at half of the hours: boards that both cameras see reach no more.
+        if (np.count_nonzero(counts, axis=1) >= HOURS // 2).sum() < 2:
             found.append("one ring only: hold it nearer, farther, higher, lower")
         return found
 
@@ -94,8 +97,6 @@ class LiveBoards:
 
     def __init__(self, board: AnyBoard) -> None:
         self._board = board
-        self._brightest: list[Image] = []  # the maximum of each camera's images, in which the rim is searched
-        self._rims: list[Mask | None] = [None, None]
         self._before: Views = (None, None)
         self._kept: list[tuple[BoardView, BoardView]] = []
         self.coverage: tuple[CameraCoverage, ...] = ()  # of both cameras after the first pair of images
@@ -110,12 +111,8 @@ class LiveBoards:
     def missing(self) -> list[str]:
         """Return what is missing until a calibration is worth while; empty where there is enough."""
         found = [f"{NEEDED_PAIRS - self.pairs} more positions"] if self.pairs < NEEDED_PAIRS else []
-        if not self.coverage:
-            return found
-        lower, upper = (coverage.missing() for coverage in self.coverage)
-        found += [f"both cameras: {words}" for words in lower if words in upper]
-        found += [f"lower camera: {words}" for words in lower if words not in upper]
-        return found + [f"upper camera: {words}" for words in upper if words not in lower]
+        sides = zip(SIDES, self.coverage, strict=True)
+        return found + [f"{name} camera: {words}" for name, coverage in sides for words in coverage.missing()]
 
     def process(self, images: Sequence[Image], *, need_still: bool) -> PairOutcome:
         """Search the board in images of the lower and the upper camera at one instant, and keep the pair if it is new.
@@ -123,7 +120,10 @@ class LiveBoards:
         need_still: the pair is kept only if the board was at the same place in the pair before.
         """
         # 1. Search the board.
-        self._update_rims(images)
+        shapes = [image.shape for image in images]
+        self.coverage = self.coverage or tuple(map(CameraCoverage, shapes))
+        if shapes != [coverage.shape for coverage in self.coverage]:
+            raise OmnidError("expected images as large as the first ones; name another folder for another size")
         lower, upper = self._pool.map(lambda image: search_board(image, self._board), images)
         before, self._before, self.views = self._before, (lower, upper), (lower, upper)
         # 2. Leave out pairs that add no information.
@@ -146,32 +146,11 @@ class LiveBoards:
         self._pool.shutdown()
 
     def _near(self, a: Views, b: Views, part: float) -> bool:
-        """True if the board moved by at most `part` of the rim's radius from a to b, in both cameras."""
+        """True if the board moved by at most `part` of the disc's radius from a to b, in both cameras."""
         return all(
-            moved(one, other) <= part * coverage.rim.outer_px
+            moved(one, other) <= part * coverage.radius_px
             for one, other, coverage in zip(a, b, self.coverage, strict=True)
         )
-
-    def _update_rims(self, images: Sequence[Image]) -> None:
-        """Search the rims in the brightest of all images until both are found; until then use the whole image."""
-        if not self._brightest:
-            self._brightest = [image.copy() for image in images]
-            # Until a rim is found, the largest disc in the image.
-            discs = [Mask(middle_px(image), 0.0, (min(image.shape) - 1) / 2) for image in images]
-            self.coverage = tuple(map(CameraCoverage, discs))
-        for name, before, image in zip(SIDES, self._brightest, images, strict=True):
-            if image.shape != before.shape:
-                expected, found_px = ("{1}x{0} px".format(*one.shape) for one in (before, image))
-                raise OmnidError(
-                    f"{name} camera: expected images of {expected} as the first ones, found {found_px}; set the size "
-                    "of the camera, or name another folder"
-                )
-        for side, image in enumerate(images):
-            if self._rims[side] is None:
-                np.maximum(self._brightest[side], image, out=self._brightest[side])
-                found = self._rims[side] = find_rim(self._brightest[side], middle_px(image))
-                if found is not None:
-                    self.coverage[side].rim = found
 
 
 def status(boards: LiveBoards, outcome: PairOutcome) -> DiagnosticStatus:
