@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from calib.rig import MountedCamera, Rig
-from calib.rig_file import read_rig, write_rig
+from calib.rig_file import read_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras, LogReader
 from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.rig_check import read_rig_pairs, with_masks
@@ -54,7 +54,6 @@ Flags = NDArray[np.bool_]
 class HeightCalibration:
     """The floor below a rig, and the rig with it."""
 
-    before: Rig
     rig: Rig  # T_base_rig with the height and the tilt; the base is on the floor
     floor: Floor
     pairs: int
@@ -66,10 +65,6 @@ class HeightCalibration:
             f"{math.degrees(floor.tilt_rad):.2f} deg (sigma {math.degrees(floor.sigma_rad):.2f}), by the floor in "
             f"{self.pairs} pairs"
         )
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the rig.toml."""
-        write_rig(Path(path), self.rig)
 
 
 def calibrate_height(
@@ -96,7 +91,7 @@ def calibrate_height(
             "the floor has texture all around (tiles, a carpet, newspapers), or give the measured height "
             "as --height-m to the command that makes the rig"
         )
-    return HeightCalibration(rig, on_floor(rig, floor), floor, len(chosen))
+    return HeightCalibration(on_floor(rig, floor), floor, len(chosen))
 
 
 def on_floor(rig: Rig, floor: Floor) -> Rig:
@@ -105,8 +100,8 @@ def on_floor(rig: Rig, floor: Floor) -> Rig:
     return replace(rig, T_base_rig=floor.T_floor_base(view) @ rig.T_base_rig)
 
 
-HEADINGS: Final = 16  # of a full turn, 22 degrees apart, so that their textures have nothing in common
-LEAST_HEADINGS: Final = 12  # because after fewer headings more of a cluttered place seems to be fixed
+# Headings of a full turn, 22 degrees apart, so that their textures have nothing in common. All of them are needed.
+HEADINGS: Final = 16
 # Least ratio of the mean and its standard error, because in a drive through clutter (872) 0.02 % of the pixels are
 # above it after 12 headings, and borders of a lens have 10 to 60.
 LEAST_RATIO: Final = 6.0
@@ -123,20 +118,12 @@ class MaskCalibration:
 
     rig: Rig
     share: float  # of the panorama, which the masks before did not hide
-    headings: int  # of HEADINGS, by which it was found
 
     def __str__(self) -> str:
         """Return the result as one line."""
         if not self.share:
-            return f"nothing is fixed to the cameras that the masks do not hide, by {self.headings} headings of a turn"
-        return (
-            f"{100 * self.share:.1f} % of the panorama is fixed to a camera, by {self.headings} headings of a turn; "
-            "the masks hide it"
-        )
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the rig.toml."""
-        write_rig(Path(path), self.rig)
+            return "nothing is fixed to the cameras that the masks do not hide"
+        return f"{100 * self.share:.1f} % of the panorama is fixed to a camera; the masks hide it"
 
 
 def calibrate_mask(
@@ -159,15 +146,15 @@ def calibrate_mask(
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:
                 parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
             front_end.complete()
-    if parts.headings < LEAST_HEADINGS:
+    if parts.headings < HEADINGS:
         raise OmnidError(
-            f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn, "
-            f"{LEAST_HEADINGS} are needed: record a log in which it turns once on the spot"
+            f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn: record a log "
+            "in which it turns once on the spot"
         )
     pixels = parts.pixels()
     # 2. The same in the images.
     lower, upper = (_masked(place, mounted, pixels) for mounted in (place.rig.lower, place.rig.upper))
-    return MaskCalibration(replace(place.rig, lower=lower, upper=upper), float(pixels.mean()), parts.headings)
+    return MaskCalibration(replace(place.rig, lower=lower, upper=upper), float(pixels.mean()))
 
 
 def _masked(place: Geometry, mounted: MountedCamera, pixels: Flags) -> MountedCamera:

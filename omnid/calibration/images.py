@@ -61,6 +61,9 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
             f"{source}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
             f"found {'a file' if source.exists() else 'no such file or folder'}"
         )
+    for side in sides:
+        if len(shapes := {image.shape for image in side.values()}) > 1:
+            raise OmnidError(f"{source}: expected all images of a camera of one size, found {sorted(shapes)}")
     if not sides[0].keys() & sides[1].keys():
         expected = "pairs like lower_001.png and upper_001.png"
         if is_log:
@@ -70,22 +73,14 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
 
 
 def _of_log(reader: LogReader, faults: list[str]) -> tuple[Images, Images]:
-    """Return the images of both cameras by the names of their pairs, all of one size; add what is wrong to faults."""
-    lower, upper, left_out = Images(), Images(), list[str]()
+    """Return the images of both cameras by the names of their pairs; add what is wrong to faults."""
+    lower, upper = Images(), Images()
     for number, *frames in spread_pairs(reader, LOG_PAIRS, TOLERANCE_NS):
         try:
-            pair = gray(frames[0]), gray(frames[1])
+            lower[f"pair{number:05d}"], upper[f"pair{number:05d}"] = gray(frames[0]), gray(frames[1])
         except FrameDecodeError as error:
-            left_out.append(str(error))
-            continue
-        expected = [next(iter(side.values()), image).shape for side, image in zip((lower, upper), pair, strict=True)]
-        if [image.shape for image in pair] != expected:
-            left_out.append("images of another size")
-            continue
-        lower[f"pair{number:05d}"], upper[f"pair{number:05d}"] = pair
+            faults.append(f"left out a pair: {error}")
     faults += reader.warnings
-    if left_out:
-        faults.append(f"left out {len(left_out)} pairs; the first: {left_out[0]}")
     return lower, upper
 
 
@@ -97,14 +92,7 @@ def _of_side(folder: Path, side: str, bits: int) -> Images:
             raise OmnidError(f"{folder}: {other.name} and {path.name} have one name; remove or rename one of them")
     if not paths:
         raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
-    images = {name: _read(path, bits) for name, path in paths.items()}
-    sizes = dict[tuple[int, ...], str]()
-    for name, image in images.items():
-        sizes.setdefault(image.shape[::-1], paths[name].name)
-    if len(sizes) > 1:
-        found = ", ".join(f"{width}x{height} ({name})" for (width, height), name in list(sizes.items())[:4])
-        raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {found}")
-    return images
+    return {name: _read(path, bits) for name, path in paths.items()}
 
 
 def _read(path: Path, bits: int) -> Image:

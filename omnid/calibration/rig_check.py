@@ -41,17 +41,7 @@ class RigCheckResult:
     skew_s: float  # median time from the lower camera's exposure to the upper one's
 
     def __str__(self) -> str:
-        """Return the result as lines of text, the condition first."""
-        finding, drift = self.finding, self.finding.drift
-        lines = [f"{finding.summary}, in {self.pairs} pairs"]
-        if drift is not None:
-            along = zip(np.rad2deg(drift.shift), np.rad2deg(drift.shift_sigma), "xy", strict=True)
-            shift = ", ".join(f"{value:+.2f} ({sigma:.2f}) along {axis}" for value, sigma, axis in along)
-            lines += [
-                f"upper viewpoint: shifted by {shift} deg, as seen from the lower one",
-                f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
-            ]
-        return "\n".join(lines)
+        return f"{self.finding.summary}, in {self.pairs} pairs"
 
 
 def check_log(log: Path, rig: Rig, cameras: LogCameras) -> RigCheckResult:

@@ -41,7 +41,7 @@ def found(scene: Path) -> HeightCalibration:
 
 def test_the_height_is_found_within_its_sigma(found: HeightCalibration) -> None:
     assert abs(found.floor.height_m - HEIGHT_M) < 2 * found.floor.sigma_m < 0.08
-    assert found.rig.height_m() == pytest.approx(found.floor.height_m, rel=1e-3) and found.before.height_m() is None
+    assert found.rig.height_m() == pytest.approx(found.floor.height_m, rel=1e-3)
     assert f"{found.floor.height_m:.3f} m (sigma" in str(found)
 
 
@@ -110,7 +110,7 @@ def test_the_command_writes_a_rig_that_needs_no_other_mask(
 
 
 def test_a_robot_that_hardly_turns_is_refused(scene: Path) -> None:
-    with pytest.raises(omnid.OmnidError, match=r"shows \d of 16 headings of a turn, 12 are needed: record a log"):
+    with pytest.raises(omnid.OmnidError, match=r"shows \d of 16 headings of a turn: record a log"):
         omnid.calibrate_mask(scene / "log.mcap", scene / "rig.toml")
 
 
