@@ -27,7 +27,6 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100  # exact: the values of nav_msgs/msg/Occupa
 # Bounds of the grid of a file and of a live one: 140 and 50 m square at cells of 0.05 m, of two bytes each.
 MAX_CELLS: Final = 8_000_000
 MAX_LIVE_CELLS: Final = 1_000_000
-MARGIN_M: Final = 5.0  # around the area of the scans, so that it need not grow with each of them
 # Log odds are stored in tenths, so that a cell is one byte. A scan adds HIT to a cell with an obstacle (odds of 2.5 to
 # 1) and subtracts MISS from a cell in front of it (1.5 to 1); by trial on development seeds.
 HIT, MISS = 9, 4
@@ -41,7 +40,8 @@ WHOLE_M: Final = 0.5
 # Factor [1/m] of the squared range by which the free space ends before an obstacle, as the noise of stereo grows so.
 SHORTER: Final = 0.02
 SHIFT: Final = 4  # fractional bits of the polygons' corners: a sixteenth of a cell is enough
-# The grid is drawn again when a keyframe has moved by half a cell, or a wall at this distance by its turn.
+# Usual range of a wall. The area has this margin, so that it need not grow with each scan, and the grid is drawn again
+# when a keyframe has moved by half a cell, or a wall at this distance by its turn.
 WALL_M: Final = 5.0
 
 
@@ -85,7 +85,7 @@ class KeyframeGrid:
         fits = (needed[0] >= self._area[0]).all() and (needed[1] <= self._area[1]).all()
         moved = [np.abs((before - now.get(id, np.inf)) * [1, 1, WALL_M]).max() for id, before in self._drawn.items()]
         if not fits or max(moved, default=0.0) > self._cell_m / 2:
-            self._clear(needed + np.array([[-MARGIN_M], [MARGIN_M]]))
+            self._clear(needed + np.array([[-WALL_M], [WALL_M]]))
         # 2. The new scans, the oldest first, because later ones count more.
         for id, pose in now.items():
             if id not in self._drawn:

@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _AXIS_BITS = 21  # Bits of a packed key per axis, so that three of them fit the 63 bits of a positive key.
-# A voxel seen once and not again for this number of frames is most likely a false match; by trial on development seeds.
-# A count and no time, as the age of a point, because each frame is another look.
-_OLD_FRAMES = 30
 # A voxel: its sums are those of information (1 / variance), and of information times x, y, z.
 VOXEL = np.dtype([("key", np.int64), ("sums", float, 4), ("frames", np.int32), ("last_seq", np.int64)])
 
@@ -94,11 +91,8 @@ class VoxelMap:
         return np.asarray(frames / (frames + 1.0) * weight / (weight + self._voxel_m**-2))
 
     def _evict(self) -> None:
-        """Drop half of the voxels: those seen once and long ago first, then the least confident."""
-        age = self._newest_seq - self._voxels["last_seq"]
-        is_old = (self._voxels["frames"] == 1) & (age > _OLD_FRAMES)
-        # The sort is stable, so the key decides about ties.
-        order = np.lexsort((self._confidence(), ~is_old))
+        """Drop half of the voxels: the least confident ones, of equal ones those seen last long ago."""
+        order = np.lexsort((self._voxels["last_seq"], self._confidence()))
         dropped = len(order) - self._most // 2
         self._voxels = self._voxels[np.sort(order[dropped:])]
 

@@ -46,10 +46,8 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is bounded
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
-APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
 # Searches in a row: of so many without success, only new keyframes are searched for; of so many that odometry
 # contradicts, it has missed a motion, because right ones in worlds that repeat had 3.
 SEARCHES: Final = 10
@@ -122,7 +120,7 @@ def _is_distinct(one: Hypothesis, others: list[Hypothesis]) -> bool:
     if one.place.inliers >= FAR.inliers:
         return True
     moved = (motion_between(one.T_odom_rect, other.T_odom_rect) for other in others)
-    return all(moved_m > APART_M or turned_rad > APART_RAD for moved_m, turned_rad in moved)
+    return all(moved_m > GATE_M or turned_rad > GATE_RAD for moved_m, turned_rad in moved)
 
 
 class MapLocaliser:
@@ -138,7 +136,7 @@ class MapLocaliser:
         self.places = places if places is not None else PlaceMap()
         self._localize_only = localize_only
         self._fixed = frozenset(self.places.keyframes if localize_only else ())  # keyframes (ids) that stay
-        self.places.max_keyframes = len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes
+        self.places.max_keyframes = len(self._fixed) + limits.max_keyframes
         # A map has the columns of full turns, whatever sector of them the cameras show.
         self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
         self.correction = MapCorrection(self.places)
@@ -179,7 +177,6 @@ class MapLocaliser:
         """Sizes and counters, for the status."""
         return {
             "keyframes": len(self.places),
-            "map_kb": self.places.nbytes // 1000,
             "loops": self.places.loops,
             "dropped": self.places.dropped,
             "unjoined": max(0, len(self.places.parts()) - 1),
@@ -271,7 +268,7 @@ class MapLocaliser:
             return True
         moved_m, turned_rad = motion_between(T_odom_searched, frame.T_odom_rect)
         is_pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
-        return is_pending and (moved_m > APART_M or turned_rad > APART_RAD)
+        return is_pending and (moved_m > GATE_M or turned_rad > GATE_RAD)
 
     def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
@@ -307,7 +304,7 @@ class MapLocaliser:
         if self._localize_only:
             features = features.first(0)
             ties = [id for id in self.places.keyframes if id not in self._fixed]
-            for id in ties[: len(ties) - TIES + 1]:
+            for id in ties[: len(ties) - self._limits.max_keyframes + 1]:
                 self.places.drop(id)
         scan, free_m = (ranges.astype(np.float16) for ranges in frame.ranges())
         of_odometry = frame.stamp_ns, frame.T_odom_rect, frame.covariance

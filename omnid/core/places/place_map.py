@@ -68,12 +68,6 @@ class PlaceKeyframe:
     free_m: NDArray[np.float16]  # (360,) in the same order, up to which floor was seen, see FreeRanges
     features: PlaceFeatures
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that the arrays of the keyframe take."""
-        arrays = self.T_odom_rect, self.covariance, self.thumbnail, self.scan, self.free_m
-        return sum(array.nbytes for array in (*arrays, self.features.descriptors, self.features.views))
-
 
 def relative_covariance(T_a_b: Array, of_a: Array, of_b: Array) -> Array:
     """Return the covariance (..., 6, 6) of T_a_b for poses whose covariances grow along the path from a to b.
@@ -133,11 +127,6 @@ class PlaceMap:
 
     def __len__(self) -> int:
         return len(self.keyframes)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that the keyframes take."""
-        return sum(keyframe.nbytes for keyframe in self.keyframes.values())
 
     @property
     def next_id(self) -> int:

@@ -17,6 +17,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from calib import se3
+from calib.fit.least_squares import MAX_STEPS
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -24,7 +25,6 @@ Indices = NDArray[np.intp]
 
 # Squared Mahalanobis distance of a right loop, because 99 % are below it (chi-squared, 6 dimensions).
 LARGEST_SQUARED: Final = 16.8
-MAX_STEPS: Final = 60  # Gauss-Newton steps; enough: 24 for 2,000 nodes, 200 loops.
 # M and rad: a smaller step is the last one, once all weights are 0 or 1, because no map is so exact.
 CONVERGED: Final = 1e-5
 DAMPING: Final = 1e-6  # added to the diagonal, 1/m^2 and 1/rad^2, so that nodes which no edge holds stay where they are
