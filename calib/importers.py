@@ -26,6 +26,7 @@ from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.rig import (
     MAX_LEAN,
+    MAX_UPPER_DELAY_S,
     MountedCamera,
     Rig,
     ShutterTimes,
@@ -133,8 +134,9 @@ def parse_chain(
         # 4. The delay of the upper camera: the difference of both cameras' shifts against the IMU's clock.
         shifts = chain[low].timeshift_cam_imu, chain[up].timeshift_cam_imu
         delay_s = 0.0 if shifts[0] is None or shifts[1] is None else shifts[1] - shifts[0]
-        with within("timeshift_cam_imu: "):
-            return replace(rig, times=ShutterTimes(delay_s))
+        if abs(delay_s) > MAX_UPPER_DELAY_S:
+            raise CalibError(f"timeshift_cam_imu: expected shifts in seconds, found a difference of {delay_s:g}")
+        return replace(rig, times=ShutterTimes(delay_s))
 
 
 def _chain(values: object) -> dict[str, KalibrCamera]:

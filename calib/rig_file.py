@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, TypeAlias
 import cv2
 import numpy as np
 from msgspec import Struct, defstruct
-from msgspec.structs import asdict, astuple
+from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from calib import se3
@@ -91,13 +91,6 @@ class CameraTable(Struct, frozen=True):
     mask: MaskTable | None = None
 
 
-class TimesTable(Struct, frozen=True):
-    """Times of exposure."""
-
-    upper_delay_s: float = 0.0
-    line_time_s: float = 0.0
-
-
 class CovarianceTable(Struct, frozen=True):
     """Names, standard deviations, and correlations: row k has the k numbers left of the diagonal."""
 
@@ -114,7 +107,7 @@ class RigTable(Struct, frozen=True):
     lower: CameraTable
     upper: CameraTable
     T_base_rig: Matrix | None = None
-    times: TimesTable | None = None
+    times: ShutterTimes = ShutterTimes()
     covariance: CovarianceTable | None = None
 
 
@@ -134,15 +127,13 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
         _require_version("schema", values.get("schema"), SCHEMA)  # first, as another one has other keys
         table = convert(RigTable, values)
         lower, upper = (_mounted(side, getattr(table, side), folder) for side in SIDES)
-        with within("times: "):
-            times = ShutterTimes(*astuple(table.times or TimesTable()))
         return Rig(
             lower,
             upper,
             np.eye(4) if table.T_base_rig is None else transform_of(table.T_base_rig, "T_base_rig"),
             (table.lower.topic, table.upper.topic),
             None if table.covariance is None else _covariance(table.covariance, table),
-            times,
+            table.times,
         )
 
 
@@ -269,7 +260,7 @@ def rig_toml(rig: Rig) -> str:
             outer_px = mask.outer_px if np.isfinite(mask.outer_px) else None
             text += _table_text(f"{side}.mask", asdict(MaskTable(mask.center, mask.inner_px, outer_px, image)))
     if rig.times != ShutterTimes():
-        text += _table_text("times", asdict(TimesTable(rig.times.upper_delay_s, rig.times.line_time_s)))
+        text += _table_text("times", asdict(rig.times))
     if (covariance := rig.covariance) is not None:
         correlation = tuple(tuple(row[:k]) for k, row in enumerate(covariance.correlation.tolist()))
         sigmas = tuple(covariance.sigmas.tolist())

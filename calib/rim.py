@@ -18,8 +18,6 @@ EDGE_FRACTION = 0.25
 EDGE_PX = 4
 # An azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle.
 INLIER_PX, MIN_SUPPORT = 2.0, 0.6
-# Least part of the circle that lies in the image, because less does not determine the centre.
-MIN_ARC = 0.4
 # Margin inside the rim and outside the hub, because blur and the last reflections at the edge.
 SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
@@ -91,7 +89,7 @@ def _fit(edges: Array) -> Array | None:
     The best of the circles through three edges a third of all apart (as RANSAC, without chance), then least squares
     over its inliers as long as they become more.
     """
-    if len(edges) < AZIMUTHS * MIN_ARC * MIN_SUPPORT:
+    if len(edges) < AZIMUTHS / 2 * MIN_SUPPORT:
         return None
     numbers = np.arange(len(edges))
     triples = np.stack([numbers, numbers + len(edges) // 3, numbers + 2 * len(edges) // 3], axis=1) % len(edges)
@@ -132,13 +130,13 @@ def _distance(points: Array, circle: Array) -> Array:
 
 
 def _supported(circle: Array, edges: Array, shape: tuple[int, ...]) -> bool:
-    """True if enough of the circle lies in the image, and enough of that part has an edge."""
+    """True if half of the circle lies in the image, as less does not determine its centre, and has an edge there."""
     azimuth = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)
     reach = circle[2] + 2 * EDGE_PX
     u, v = circle[0] + reach * np.cos(azimuth), circle[1] + reach * np.sin(azimuth)
     possible = int(((u >= 0) & (v >= 0) & (u <= shape[1] - 1) & (v <= shape[0] - 1)).sum())
     inliers = int((_distance(edges, circle) < INLIER_PX).sum())
-    return possible >= MIN_ARC * AZIMUTHS and inliers >= MIN_SUPPORT * possible
+    return possible >= AZIMUTHS / 2 and inliers >= MIN_SUPPORT * possible
 
 
 def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, threshold: float) -> float:

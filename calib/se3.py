@@ -131,14 +131,14 @@ def yaw(T: ArrayLike) -> Array:
     return np.asarray(np.arctan2(T[..., 1, 0], T[..., 0, 0]))
 
 
-def is_rigid(T: ArrayLike, tolerance: float = 1e-4) -> bool:
-    """True if T is a finite (4, 4) rotation and translation (no scale, no reflection)."""
+def is_rigid(T: ArrayLike) -> bool:
+    """True if T is a finite (4, 4) rotation and translation (no scale, no reflection), to three digits."""
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
     rigid, R = np.eye(4), R_of(T)
     off = max(np.abs(R @ R.T - R_of(rigid)).max(), np.abs(T[-1] - rigid[-1]).max())
-    return bool(off <= tolerance and np.linalg.det(R) > 0)
+    return bool(off <= 1e-3 and np.linalg.det(R) > 0)
 
 
 def _quaternion(rows: Any) -> Any:

@@ -23,9 +23,6 @@ from calib.typed_toml import bytes_of, shown
 MAX_FILE_BYTES = 16_000_000
 MAX_SIDE_PX = 32767  # because OpenCV's remap takes no larger images
 MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memory
-# A rotation within this of an orthonormal one is used as it is; others are made orthonormal, up to numbers that are
-# typed with three digits.
-ORTHONORMAL_TOLERANCE, TYPED_TOLERANCE = 1e-9, 1e-3
 Warn: TypeAlias = Callable[[str], None]
 
 
@@ -60,10 +57,10 @@ def transform_of(rows: Sequence[Sequence[float]] | None, key: str) -> Array:
     if rows is None or [len(row) for row in rows] != [4, 4, 4, 4]:
         raise CalibError(f"{key}: expected 4 rows of 4 numbers, found {'nothing' if rows is None else shown(rows)}")
     T = np.array(rows, float)
-    if not se3.is_rigid(T, TYPED_TOLERANCE):
+    if not se3.is_rigid(T):
         raise CalibError(f"{key}: expected a rotation and a translation over 0 0 0 1, found {shown(rows)}")
     R = se3.R_of(T)
-    if np.abs(R @ R.T - np.eye(3)).max() <= ORTHONORMAL_TOLERANCE:
+    if np.allclose(R @ R.T, np.eye(3)):
         return T
     left, _, right = np.linalg.svd(R)
     return se3.transform(left @ right, se3.t_of(T))

@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.models.camera import CONVERGED_PART, NEWTON_STEPS, Array
 
-# Columns by which a full turn may differ from the image's width, so that the two ends of the image still meet.
-SEAM_PX = 1e-3
-
 
 class _Lens:
     """Common part of all lens models: focal lengths (fu, fv) [px], centre (pu, pv) [px], size."""
@@ -154,7 +151,7 @@ class EquirectangularCamera(_Lens):
 
     def __post_init__(self) -> None:
         self._check("equirectangular")
-        if self.size[0] > self._turn_px + SEAM_PX:
+        if self.size[0] > round(self._turn_px):
             raise CalibError(
                 f"equirectangular camera: {self.size[0]} columns are more than a full turn of {self._turn_px:.1f}"
             )
@@ -173,7 +170,7 @@ class EquirectangularCamera(_Lens):
         azimuth = np.where(((x == 0) & (y == 0) & (z == 0)) | ~np.isfinite(x + y + z), np.nan, azimuth)
         u, middle = self.center[0] + self.focal[0] * azimuth, (self.size[0] - 1) / 2
         u = middle + (u - middle + self._turn_px / 2) % self._turn_px - self._turn_px / 2
-        if abs(self._turn_px - self.size[0]) <= SEAM_PX:
+        if round(self._turn_px) == self.size[0]:
             u = np.clip(u, 0.0, self.size[0] - 1.0)
         return np.column_stack([u, self.center[1] + self.focal[1] * elevation])
 

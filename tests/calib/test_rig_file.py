@@ -93,7 +93,7 @@ ROWS = "[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]"
         ("T_rig_lower = [", "T_rig_upper = [", "lower: expected T_rig_lower, found that of the other camera"),
         (ROWS, ROWS.replace("0.0, 1.0", "0.5, 1.0"), "T_base_rig: expected a rotation"),
         ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected an image"),
-        ("upper_delay_s = 0.00725", "upper_delay_s = 2.0", "times: times of exposure: expected"),
+        ("upper_delay_s = 0.00725", "upper_delay_s = 2.0", "times.upper_delay_s: expected a number from -1.0 to 1.0"),
         ('"lower xi"', '"baseline"', "covariance: expected different parameters"),
         ("sigma = [2.0, ", "sigma = [", "covariance: expected 3 sigmas"),
         ("[0.0, 0.25]", "[0.0]", "covariance.correlation: expected 3 rows"),
