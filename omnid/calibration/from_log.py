@@ -100,8 +100,8 @@ def on_floor(rig: Rig, floor: Floor) -> Rig:
     return replace(rig, T_base_rig=floor.T_floor_base(view) @ rig.T_base_rig)
 
 
-# Headings of a full turn, 22 degrees apart, so that their textures have nothing in common. All of them are needed.
-HEADINGS: Final = 16
+HEADINGS: Final = 16  # of a full turn, 22 degrees apart, so that their textures have nothing in common
+LEAST_HEADINGS: Final = 12  # because after fewer headings more of a cluttered place seems to be fixed
 # Least ratio of the mean and its standard error, because in a drive through clutter (872) 0.02 % of the pixels are
 # above it after 12 headings, and borders of a lens have 10 to 60.
 LEAST_RATIO: Final = 6.0
@@ -146,10 +146,10 @@ def calibrate_mask(
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:
                 parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
             front_end.complete()
-    if parts.headings < HEADINGS:
+    if parts.headings < LEAST_HEADINGS:
         raise OmnidError(
-            f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn: record a log "
-            "in which it turns once on the spot"
+            f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn, "
+            f"{LEAST_HEADINGS} are needed: record a log in which it turns once on the spot"
         )
     pixels = parts.pixels()
     # 2. The same in the images.

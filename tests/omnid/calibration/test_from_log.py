@@ -110,7 +110,7 @@ def test_the_command_writes_a_rig_that_needs_no_other_mask(
 
 
 def test_a_robot_that_hardly_turns_is_refused(scene: Path) -> None:
-    with pytest.raises(omnid.OmnidError, match=r"shows \d of 16 headings of a turn: record a log"):
+    with pytest.raises(omnid.OmnidError, match=r"shows \d of 16 headings of a turn, 12 are needed: record a log"):
         omnid.calibrate_mask(scene / "log.mcap", scene / "rig.toml")
 
 
