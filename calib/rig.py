@@ -19,6 +19,7 @@ from calib.errors import CalibError
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.names import sees_directly, visible_part
 
+SIDES = ("lower", "upper")
 # Rotation [rad] and direction of the baseline [rad], in the rectified frame; length of the baseline [m].
 TRANSFORM_NAMES = ("r_x", "r_y", "r_z", "e_x", "e_y", "baseline")
 # Correlations and translations [m] are rounded, so that their text is exact, by which an eigenvalue may be negative.

@@ -27,13 +27,12 @@ from calib.models.camera import Mask, OmniCamera
 from calib.models.names import MODELS, camera_of, is_coefficient, model_name, names_of, values_of
 from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
-from calib.rig import DECIMALS, TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
+from calib.rig import DECIMALS, SIDES, TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
 from calib.typed_toml import convert, shown, table_of, toml_value
 from calib.validation import read_bytes, require_image_size, transform_of
 
 # Version of the file and of its table [covariance]: it rises when an earlier program would misread them.
 SCHEMA: Final = 1
-SIDES: Final = ("lower", "upper")
 EMBEDDED: Final = "data:image/png;base64,"
 
 # 1. The tables of the file.

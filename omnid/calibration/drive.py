@@ -87,9 +87,10 @@ def calibrate_drive(
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
     steps = straightened(paths[0], parameters, cameras, config, progress)
     require_same_rig(parameters, steps)
-    # 3. Track and adjust: each round tracks in panoramas of the rig of the one before.
+    # 3. Track and adjust: each round tracks in panoramas of the rig of the one before, the first one in those of a rig
+    #    that is hardly known.
     correlated = 1.0 if before.covariance is None else CORRELATED_OBSERVATIONS
-    for number in range(ROUNDS):
+    for number in range(1 + ROUNDS):
         drives = collect(paths, parameters.at(steps), cameras, config)
         tracked = replace(drives.state, steps=steps)
         found = adjust_drive(parameters, tracked, drives.observations, drives.fixed, correlated=correlated)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig import SIDES
 from drivers.errors import FrameDecodeError
 from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES, image_folders
@@ -20,7 +21,6 @@ from omnid.errors import OmnidError
 Image = NDArray[np.uint8]
 # Images of one camera by the name of their instant, all of one size.
 Images = dict[str, Image]
-SIDES = ("lower", "upper")
 # Largest difference between the stamps of a pair: boards are held still, so that 10 ms show the same instant.
 TOLERANCE_NS = 10_000_000
 # Number of pairs of a log that are used, evenly spread: a board held by hand moves little between two of them.

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
@@ -16,10 +15,11 @@ from numpy.typing import NDArray
 
 from calib.boards.board import AnyBoard, BoardView
 from calib.models.camera import Array
+from calib.rig import SIDES
 from drivers.errors import FrameDecodeError
 from drivers.frame import FrameSource, gray
 from omnid.calibration.board_search import search_board
-from omnid.calibration.images import SIDES, Image
+from omnid.calibration.images import Image
 from omnid.errors import OmnidError
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import CALIBRATION, Key, entry
@@ -33,36 +33,33 @@ STILL_PART: Final = 0.004  # a board that is held still moves less between two i
 Views = tuple[BoardView | None, BoardView | None]
 
 
-@dataclass(frozen=True, slots=True)
 class CameraCoverage:
-    """Views of one camera with images of a shape (H, W): in the largest disc of these."""
+    """What the views of one camera with images of a shape (H, W) cover of the largest disc in these."""
 
-    shape: tuple[int, ...]
-    views: list[Array] = field(default_factory=list)  # (N, 2) px each, finite
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.shape = shape
+        # The number of views (RINGS, HOURS) that have a corner there; hour 0 is at 12 o'clock.
+        self.counts = np.zeros((RINGS, HOURS), np.int64)
 
     @property
     def radius_px(self) -> float:
         """Return the radius of the disc."""
         return min(self.shape) / 2
 
-    def counts(self) -> NDArray[np.int64]:
-        """Return the number of views (RINGS, HOURS) that have a corner there; hour 0 is at 12 o'clock."""
-        total = np.zeros((RINGS, HOURS), np.int64)
-        for pixels in self.views:
-            seen = np.zeros((RINGS, HOURS), bool)
-            offset = pixels - np.array(self.shape[::-1]) / 2
-            ring = (np.hypot(*offset.T) / self.radius_px * RINGS).astype(int)
-            seen[np.minimum(ring, RINGS - 1), hours_of(offset)] = True
-            total += seen
-        return total
+    def add(self, pixels: Array) -> None:
+        """Count a view with corners at pixels (N, 2), those that are not known NaN."""
+        offset = pixels[np.isfinite(pixels[:, 0])] - np.array(self.shape[::-1]) / 2
+        ring = (np.hypot(*offset.T) / self.radius_px * RINGS).astype(int)
+        seen = np.zeros((RINGS, HOURS), bool)
+        seen[np.minimum(ring, RINGS - 1), hours_of(offset)] = True
+        self.counts += seen
 
     def missing(self) -> list[str]:
         """Return a text about what no board covers yet, for the person who holds the board."""
-        counts = self.counts()
-        hours = [int(hour) or HOURS for hour in np.flatnonzero(counts.sum(axis=0) == 0)]
+        hours = [int(hour) or HOURS for hour in np.flatnonzero(self.counts.sum(axis=0) == 0)]
         found = [f"no board at {', '.join(map(str, sorted(hours)))} o'clock"] if hours else []
         # Two rings need boards at half of the hours: boards that both cameras see reach no more.
-        if (np.count_nonzero(counts, axis=1) >= HOURS // 2).sum() < 2:
+        if (np.count_nonzero(self.counts, axis=1) >= HOURS // 2).sum() < 2:
             found.append("one ring only: hold it nearer, farther, higher, lower")
         return found
 
@@ -70,7 +67,7 @@ class CameraCoverage:
 def hours_of(offset: Array) -> NDArray[np.int64]:
     """Return the hours (N,) of offsets (N, 2) px from the centre of an image, 0 at 12 o'clock; v points down."""
     clockwise = np.arctan2(offset[:, 0], -offset[:, 1]) / (2 * math.pi)
-    return np.round(np.nan_to_num(clockwise) * HOURS).astype(np.int64) % HOURS
+    return np.round(clockwise * HOURS).astype(np.int64) % HOURS
 
 
 def moved(a: BoardView | None, b: BoardView | None) -> float:
@@ -100,7 +97,6 @@ class LiveBoards:
         self._before: Views = (None, None)
         self._kept: list[tuple[BoardView, BoardView]] = []
         self.coverage: tuple[CameraCoverage, ...] = ()  # of both cameras after the first pair of images
-        self.views: Views = (None, None)  # of the newest images
         self._pool = ThreadPoolExecutor(len(SIDES))
 
     @property
@@ -125,7 +121,7 @@ class LiveBoards:
         if shapes != [coverage.shape for coverage in self.coverage]:
             raise OmnidError("expected images as large as the first ones; name another folder for another size")
         lower, upper = self._pool.map(lambda image: search_board(image, self._board), images)
-        before, self._before, self.views = self._before, (lower, upper), (lower, upper)
+        before, self._before = self._before, (lower, upper)
         # 2. Leave out pairs that add no information.
         if lower is None and upper is None:
             return PairOutcome.NO_BOARD
@@ -138,7 +134,7 @@ class LiveBoards:
         # 3. Keep the pair, and count what it covers.
         self._kept.append((lower, upper))
         for coverage, view in zip(self.coverage, (lower, upper), strict=True):
-            coverage.views.append(view.pixels[np.isfinite(view.pixels).all(axis=1)])
+            coverage.add(view.pixels)
         return PairOutcome.KEPT
 
     def close(self) -> None:
@@ -157,7 +153,7 @@ def status(boards: LiveBoards, outcome: PairOutcome) -> DiagnosticStatus:
     """Return the progress as an entry of the status, for the page."""
     values = {Key.PAIRS: str(boards.pairs), Key.NEEDED: str(NEEDED_PAIRS)}
     for key, coverage in zip((Key.LOWER_COVERAGE, Key.UPPER_COVERAGE), boards.coverage, strict=False):
-        values[key] = "".join(str(min(9, count)) for count in coverage.counts().ravel())
+        values[key] = "".join(str(min(9, count)) for count in coverage.counts.ravel())
     return entry(CALIBRATION, {**values, Key.MISSING: "; ".join(boards.missing()), "_words": outcome})
 
 

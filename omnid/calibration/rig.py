@@ -11,11 +11,11 @@ import numpy as np
 from calib import se3
 from calib.atomic_file import write_file
 from calib.boards.board import AnyBoard, AprilGrid, Board, BoardView
-from calib.fit.boards.rig_fit import SIDES, PairView, RigCalibration, calibrate_boards, rig_covariance
-from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
+from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
+from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.names import sees_directly
 from calib.models.ocam import View
-from calib.rig import Rig, mounting_notes, rig_between
+from calib.rig import SIDES, Rig, mounting_notes, rig_between
 from calib.rig_file import write_rig
 from calib.rim import find_rim
 from calib.validation import silent
@@ -27,7 +27,7 @@ from omnid.calibration.board_search import (
     view_of_tags,
 )
 from omnid.calibration.images import PairedImages, brightest, read_pairs
-from omnid.calibration.rig_report import Row, angle_lines, angle_rows, rig_report_html
+from omnid.calibration.rig_report import angle_lines, angle_rows, rig_report_html
 from omnid.errors import OmnidError
 
 # Relative difference from the baseline by ruler that is no error of a ruler.
@@ -41,17 +41,11 @@ class RigResult:
     rig: Rig
     calibration: RigCalibration
     images: PairedImages
-    notes: tuple[str, ...]  # about repeated images, order of the cameras, and masks that are missing
-    drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras see too little in common
-    angles: tuple[tuple[Row, ...], ...]  # residuals of the lower and the upper camera
-
-    @property
-    def warnings(self) -> list[str]:
-        """Limits of the result, one line each."""
-        return [*self.notes, *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected)]
+    warnings: tuple[str, ...]  # about images that were left out, order of the cameras, and masks that are missing
 
     def __str__(self) -> str:
-        found = self.calibration
+        # Errors of drives by the covariance: None if the cameras see too little in common.
+        found, drives = self.calibration, drive_uncertainty(self.rig)
         rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(found.T_upper_lower))))
         sigma_deg = np.rad2deg(np.linalg.norm(found.motion_sigma[3:]))
         single_views = len(found.views) - found.pairs
@@ -60,14 +54,15 @@ class RigResult:
             f"{found.baseline_sigma_m * 1e3:.2f}), upper rotated by {rotation_deg:.3f} deg (sigma {sigma_deg:.3f}),"
             f" mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs"
             + (f", {single_views} views of one camera alone" if single_views else "")
-            + (f"; drives: {self.drives}" if self.drives else "")
+            + (f"; drives: {drives}" if drives else "")
         )
 
     @property
     def tables(self) -> list[str]:
         """Return the shape of the print, and the tables of residuals by the angle from the axis, in lines."""
-        angles = [line for name, rows in zip(SIDES, self.angles, strict=True) for line in angle_lines(name, rows)]
-        return [self.calibration.shape.described(self.calibration.board.points), *angles]
+        found = self.calibration
+        angles = [line for side in range(len(SIDES)) for line in angle_lines(SIDES[side], angle_rows(found, side))]
+        return [found.shape.described(found.board.points), *angles]
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the rig.toml."""
@@ -75,7 +70,7 @@ class RigResult:
 
     def save_report(self, path: str | PathLike[str]) -> None:
         """Write an HTML page with residuals and coverage."""
-        write_file(Path(path), rig_report_html(self.calibration, self.images, self.angles).encode())
+        write_file(Path(path), rig_report_html(self.calibration, self.images).encode())
 
 
 def calibrate_rig(
@@ -114,12 +109,11 @@ def calibrate_rig(
     # 5. Compare the baseline with what it can be.
     if expected_baseline_m is not None:
         _check_baseline(found, board, expected_baseline_m)
-    # 6. Build the rig with masks and covariance, and predict the errors of drives.
+    # 6. Build the rig with masks and covariance.
     rig, unmasked = _masked_rig(found, images)
     rig = replace(rig, covariance=rig_covariance(found, rig))
-    angles = tuple(tuple(angle_rows(found, side)) for side in range(len(SIDES)))
-    notes = (*images.notes, *mounting_notes(rig), *unmasked)
-    return RigResult(rig, found, images, notes, drive_uncertainty(rig), angles)
+    left_out = [f"left out {bad.name}: {bad.reason}" for bad in found.rejected]
+    return RigResult(rig, found, images, (*images.notes, *mounting_notes(rig), *unmasked, *left_out))
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from calib.fit.boards.rig_fit import RigCalibration
-from omnid.calibration.images import SIDES, PairedImages
+from calib.rig import SIDES
+from omnid.calibration.images import PairedImages
 from omnid.calibration.snapshot import GREEN, RED
 from omnid.report.page import figure, page, table
 
@@ -20,8 +21,8 @@ Row: TypeAlias = tuple[str, str, str]  # angle from the axis, corners, rms [px]
 ARROW = 40.0
 
 
-def rig_report_html(found: RigCalibration, images: PairedImages, angles: Sequence[Sequence[Row]]) -> str:
-    """Return the page; angles: the tables of the lower and the upper camera."""
+def rig_report_html(found: RigCalibration, images: PairedImages) -> str:
+    """Return the page."""
     left_out = "".join(
         f"<p class='warn'>left out {escape(bad.name)}: {escape(bad.reason)}</p>" for bad in found.rejected
     )
@@ -30,8 +31,8 @@ def rig_report_html(found: RigCalibration, images: PairedImages, angles: Sequenc
         f"<b>Baseline {found.baseline_m * 1e3:.2f} mm</b>, standard deviation {found.baseline_sigma_m * 1e3:.2f} "
         f"mm. Mean reprojection error {found.fit.mean_px:.3f} px.</p>{left_out}",
     ]
-    for name, by_angle in zip(SIDES, angles, strict=True):
-        parts += [f"<h2>The {name} camera</h2>", table(HEAD, by_angle)]
+    for side, name in enumerate(SIDES):
+        parts += [f"<h2>The {name} camera</h2>", table(HEAD, angle_rows(found, side))]
     coverage = "".join(_coverage(found, images, side) for side in range(len(SIDES)))
     return page("Rig calibration", [*parts, "<h2>Coverage</h2>", f"<div class='tiles wide'>{coverage}</div>"])
 

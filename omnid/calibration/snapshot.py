@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 
 from calib.models.camera import Mask
-from calib.rim import EDGE_PX, find_rim
+from calib.rim import find_rim
 from omnid.calibration.images import Image, brightest, middle_px
 from omnid.core.stereo.tiles import SATURATED_GREY
 
@@ -26,8 +25,8 @@ class CameraView:
     image: Image  # (H, W) the newest
     rim: Mask | None  # None: no rim was found with certainty
     focus: float  # variance of the Laplacian (Pech-Pacheco et al. 2000), as a share of that of the grey levels
-    level_grey: float  # mean grey level of the world
-    saturated: float  # share of its pixels that are too bright
+    level_grey: float  # mean grey level
+    saturated: float  # share of the pixels that are too bright
 
 
 def view_of(images: Sequence[Image]) -> CameraView:
@@ -35,15 +34,8 @@ def view_of(images: Sequence[Image]) -> CameraView:
     newest = images[-1]
     rim = find_rim(brightest(images), middle_px(newest))
     smooth = cv2.GaussianBlur(newest, (0, 0), 0.8).astype(np.float32)  # the Laplacian sees noise first
-    v, u = np.indices(newest.shape)
-    world = np.ones(newest.shape, bool)
-    if rim is not None:
-        world = rim.contains(np.column_stack([u.ravel(), v.ravel()]).astype(float), EDGE_PX).reshape(newest.shape)
-    if not world.any():
-        return CameraView(newest, rim, math.nan, math.nan, math.nan)
-    grey = newest[world]
-    focus = float(cv2.Laplacian(smooth, cv2.CV_32F)[world].var() / max(1.0, grey.var()))
-    return CameraView(newest, rim, focus, float(grey.mean()), float((grey >= SATURATED_GREY).mean()))
+    focus = float(cv2.Laplacian(smooth, cv2.CV_32F).var() / max(1.0, newest.var()))
+    return CameraView(newest, rim, focus, float(newest.mean()), float((newest >= SATURATED_GREY).mean()))
 
 
 def described(view: CameraView) -> str:

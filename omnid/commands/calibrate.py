@@ -17,14 +17,14 @@ from calib.atomic_file import write_file
 from calib.boards.board import AnyBoard, AprilGrid, Board
 from calib.importers import import_pair, parse_chain, stacked_rig, straight_up
 from calib.models.names import model_in_words
-from calib.rig import Rig
+from calib.rig import SIDES, Rig
 from calib.rig_file import png, read_rig, write_rig
 from calib.validation import read_text, silent
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.board_search import require_one_orientation
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
-from omnid.calibration.images import SIDES, read_pairs
+from omnid.calibration.images import read_pairs
 from omnid.calibration.live_boards import LiveBoards, newest_pairs, status
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.rig_check import check_log

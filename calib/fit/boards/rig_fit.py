@@ -19,7 +19,7 @@ from calib.fit.boards.start import LinearCamera, initialise_relative_pose, solve
 from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
-from calib.rig import TRANSFORM_NAMES, Rig, RigCovariance
+from calib.rig import SIDES, TRANSFORM_NAMES, Rig, RigCovariance
 
 # With four views the median of their errors still shows which one is wrong; fewer are not enough for that.
 MIN_VIEWS: Final = 4
@@ -28,7 +28,6 @@ MIN_VIEWS: Final = 4
 BAD_RATIO, BAD_PX, BAD_RAD = 4.0, 0.25, 0.01
 # Larger mean errors mean that the images do not show one board at one time: right ones have 0.05 to 0.15 px.
 MAX_MEAN_PX: Final = 3.0
-SIDES: Final = ("lower", "upper")
 Images = Mapping[str, NDArray[np.uint8]]
 Progress = Callable[[str], None]
 
