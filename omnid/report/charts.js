@@ -9,11 +9,7 @@
   const HEIGHT_PX = 190;
   const charts = [];
 
-  const clock = (t) => {
-    if (run.end < 300) return `${+t.toFixed(2)} s`;
-    const whole = Math.round(Math.abs(t)), two = (n) => String(n).padStart(2, "0");
-    const minutes = Math.floor(whole / 60) % 60;
-    return `${t < 0 ? "-" : ""}${Math.floor(whole / 3600)}:${two(minutes)}:${two(whole % 60)}`;
+  const clock = (t) => `${+t.toFixed(2)} s`;
   };
   const number = (v) => v == null ? "" : String(+v.toPrecision(4));
 

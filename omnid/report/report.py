@@ -41,7 +41,7 @@ def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
         "all.</p>",
         "<h2>Events</h2>",
         *(() if (run.ranks != UNKNOWN).any() else [note("The log does not hold the state of the odometry.")]),
-        *_events_table(events, end_s),
+        *_events_table(events),
         *(f"<h2>{title}</h2>{''.join(section)}" for title, section in _sections(run, true)),
         f"<p><small>Made by omnid {__version__}.</small></p></main>",
     ]
@@ -57,7 +57,7 @@ def _head(run: RecordedRun) -> list[str]:
         f"{run.frames[0]} on {run.topic}, from {utc(run.start_ns)}."
     )
     rate = f", {(count - 1) / end_s:.1f}/s" if end_s > 0 else ""
-    tiles = [("duration", _clock(end_s, end_s)), ("path", f"{run.length_m():.2f} m"), ("poses", f"{count}{rate}")]
+    tiles = [("duration", _time(end_s)), ("path", f"{run.length_m():.2f} m"), ("poses", f"{count}{rate}")]
     known = run.ranks[run.ranks != UNKNOWN]
     if len(known):
         tiles += [(name, f"{100 * (known == rank).mean():.1f} %") for rank, name in enumerate(STATES)]
@@ -142,13 +142,13 @@ def _path_name(rank: int) -> str:
     return str(STATES[rank]) if rank >= 0 else "tracking"
 
 
-def _events_table(events: Sequence[Event], end_s: float) -> list[str]:
+def _events_table(events: Sequence[Event]) -> list[str]:
     """Return the table of events in the order of time."""
     if not events:
         return ["<p>No events: no change of state, no gap, no loss.</p>"]
     rows = []
     for event in events[:MOST_ENTRIES]:
-        start, end = (_clock(at_s, end_s) for at_s in (event.start_s, event.end_s))
+        start, end = (_time(at_s) for at_s in (event.start_s, event.end_s))
         text = f"{event.text} ({event.count})" if event.count else event.text
         times = start if start == end else f"{start} to {end}"
         rows.append((times, LEVELS[event.level], escape(event.source), escape(text)))
@@ -156,12 +156,9 @@ def _events_table(events: Sequence[Event], end_s: float) -> list[str]:
     return ["<div class='events'>", table(("time", "", "part", "event (count)"), rows), "</div>", *more]
 
 
-def _clock(seconds: float, end_s: float) -> str:
-    """Return a time as text: in seconds, as in the charts, if the end of the run (end_s) is below 300 s."""
-    if end_s < 300:
-        return f"{seconds:.2f}".rstrip("0").rstrip(".") + " s"
-    minutes, rest_s = divmod(abs(seconds), 60)
-    return f"{'-' if seconds < 0 else ''}{minutes // 60:.0f}:{minutes % 60:02.0f}:{rest_s:04.1f}"
+def _time(seconds: float) -> str:
+    """Return a time as the charts show it."""
+    return f"{seconds:.2f}".rstrip("0").rstrip(".") + " s"
 
 
 def _rounded(text: str) -> str:
