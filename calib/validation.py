@@ -60,7 +60,7 @@ def transform_of(rows: Sequence[Sequence[float]] | None, key: str) -> Array:
     if not se3.is_rigid(T):
         raise CalibError(f"{key}: expected a rotation and a translation over 0 0 0 1, found {shown(rows)}")
     R = se3.R_of(T)
-    if np.allclose(R @ R.T, np.eye(3)):
+    if np.allclose(R @ R.T, np.eye(3), rtol=0):
         return T
     left, _, right = np.linalg.svd(R)
     return se3.transform(left @ right, se3.t_of(T))

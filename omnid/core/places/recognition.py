@@ -39,6 +39,7 @@ LARGEST_SQUARED: Final = 0.35 * 512**2  # Squared distance of descriptors that m
 FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
 SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted, of 45 degrees.
 AMBIGUOUS: Final = 0.6  # Share of the inliers with which another place makes a recognition ambiguous.
+ELSEWHERE_M, ELSEWHERE_RAD = 0.5, math.radians(10)  # Poses farther apart are different places.
 NEAR_M: Final = 1.5  # Keyframes within this distance of the pose by odometry are searched, besides its error.
 # Largest error of odometry, and its growth with the path [m, m/m; rad, rad/m].
 GATE_M, GATE_PER_M = 0.15, 0.05
@@ -173,7 +174,7 @@ def search(
         assert best is not None
         T_best, T_other = (poses[each.id] @ each.T_place_rect for each in (best, other))
         moved_m, turned_rad = motion_between(T_best, T_other)
-        is_elsewhere = moved_m > GATE_M or turned_rad > GATE_RAD
+        is_elsewhere = moved_m > ELSEWHERE_M or turned_rad > ELSEWHERE_RAD
         if is_elsewhere and other.inliers > AMBIGUOUS * best.inliers:
             return None
     return best
