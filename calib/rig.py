@@ -128,7 +128,7 @@ class Rig:
     T_base_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4)
     topics: tuple[str, str] = ("", "")  # of the lower and the upper camera's images; "" if unknown
     covariance: RigCovariance | None = None  # of the calibration
-    times: ShutterTimes = ShutterTimes()
+    times: ShutterTimes = field(default_factory=ShutterTimes)
 
     def __post_init__(self) -> None:
         for name, T in (
