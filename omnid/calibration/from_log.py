@@ -36,7 +36,7 @@ from drivers.logs.log_reader import AnyCameras, LogCameras, LogReader
 from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
-from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator
+from omnid.core.floor import Floor, common_floor
 from omnid.core.frames import of_base
 from omnid.core.obstacles.plane_view import AROUND_ROWS, DIRECTIONS, FOCAL_PX, TEXTURE_SHARE
 from omnid.core.types.panorama import PaddedPanorama
@@ -48,6 +48,8 @@ from omnid.tracking_state import TrackingState
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+
+MOST_PAIRS: Final = 12  # whose floors are compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +82,9 @@ def calibrate_height(
     config = Config()
     front_end = FrontEnd(geometry(with_masks(log, rig, cameras), config.panorama), config)
     view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]
-    estimator, chosen = FloorEstimator(), pairs[:: -(-len(pairs) // MOST_PAIRS)]
-    for pair in chosen:
-        depth = front_end.dense.points(front_end.dewarp.process(pair))
-        estimator.add(se3.apply(rig.T_base_rig, depth.points) - view, depth.variance_m2)
-    floor = estimator.floor
+    chosen = pairs[:: -(-len(pairs) // MOST_PAIRS)]
+    depths = (front_end.dense.points(front_end.dewarp.process(pair)) for pair in chosen)
+    floor = common_floor((se3.apply(rig.T_base_rig, one.points) - view, one.variance_m2) for one in depths)
     if floor is None:
         raise OmnidError(
             f"calibrate drive: {log}: the floor is not seen in {len(chosen)} pairs: record a log where "

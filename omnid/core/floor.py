@@ -15,6 +15,7 @@ Points of one surface share their errors: CORRELATED_POINTS of them count as one
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -52,10 +53,6 @@ LEAST_SECTORS: Final = 12
 RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])
 # Pairs whose heights scatter by more show no common floor; those of one floor scatter by 6 mm.
 LARGEST_SCATTER_M: Final = 0.05
-# Number of pairs after which the floor is constant and costs no more time.
-MOST_PAIRS: Final = 12
-# Numbers of pairs after which the median is published again; each time what depends on the floor is computed again.
-RENEWED_AT: Final = (3, 6, MOST_PAIRS)
 
 
 class Floor(NamedTuple):
@@ -147,34 +144,15 @@ def _densities(e: Array, sigma_m: Array, span_m: float | Array) -> tuple[Array, 
     return on, ((1 - FALSE) * below + FALSE) / span_m
 
 
-class FloorEstimator:
-    """The floor of a run: the medians of what its first pairs show, then constant."""
-
-    def __init__(self) -> None:
-        self._fits: list[FloorFit] = []
-        self.floor: Floor | None = None  # None: not seen, or the pairs contradict one another
-
-    @property
-    def is_final(self) -> bool:
-        """True if more pairs change nothing."""
-        return len(self._fits) >= MOST_PAIRS
-
-    def add(self, points: Array, variance_m2: Array) -> None:
-        """Add a pair: see `fit_floor`."""
-        found = None if self.is_final else fit_floor(points, variance_m2)
-        if found is None:
-            return
-        self._fits.append(found)
-        is_evident = sum(fit.evidence for fit in self._fits) > LEAST_EVIDENCE
-        if is_evident and (self.floor is None or len(self._fits) in RENEWED_AT):
-            self.floor = _median(np.array([fit.floor for fit in self._fits]))
-
-
-def _median(fits: Array) -> Floor | None:
-    """Return the median of floors (K, 5); None where they scatter.
+def common_floor(pairs: Iterable[tuple[Array, Array]]) -> Floor | None:
+    """Return the median of the floors that pairs show (see `fit_floor`); None: not seen, or they contradict each other.
 
     Errors of pairs are not independent: their number makes the sigma no smaller than that of one pair.
     """
+    found = [fit for points, variance_m2 in pairs if (fit := fit_floor(points, variance_m2)) is not None]
+    if sum(fit.evidence for fit in found) <= LEAST_EVIDENCE:
+        return None
+    fits = np.array([fit.floor for fit in found])
     middle = np.median(fits, axis=0)
     scatter = SIGMA_PER_MAD * np.median(np.abs(fits - middle), axis=0)
     if scatter[0] > LARGEST_SCATTER_M:

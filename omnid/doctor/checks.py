@@ -138,7 +138,7 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
             other = f"{path}: the {name} camera was calibrated with {width}x{height} px, [cameras] asks for {wanted}"
             yield Finding("error", "rig", other, "set cameras.width_px and height_px")
     if (height_m := found.height_m(floor_m)) is None:
-        unknown = f"{path} does not state the height of the cameras: nothing is free until the images show the floor"
+        unknown = f"{path} does not state the height of the cameras: nothing is free"
         advice = "state it by `omnid calibrate drive LOG --only height`"
         yield Finding("warning", "rig", unknown, advice)
     else:

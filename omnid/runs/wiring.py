@@ -216,7 +216,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         grid = MapGrid(config.mapping.voxel_m, T_base_rect, inputs.map_every_s)
         grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
     if config.obstacles.enabled and (outputs.scans or has_outgoing or inputs.navigation):
-        obstacles = Obstacles(geometry, config.obstacles, front_end.dense)
+        obstacles = Obstacles(geometry, config.obstacles)
         scans = graph.stage("obstacles", obstacles, poses)
 
     # 4. All of them, and requests, give the way to drive. Routes and copies of the map are written by another thread.

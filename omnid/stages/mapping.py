@@ -20,7 +20,7 @@ from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.messages import DensePoints, GridUpdate, MapKeyframes, MapUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.stages.geometry import DenseDepths, Geometry
-from omnid.stages.obstacles import CameraFloor, Obstacles
+from omnid.stages.obstacles import Obstacles, floor_frame
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -141,8 +141,8 @@ class Places:
         self._T_rig_rect = geometry.T_rig_rect
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._limits = config.obstacles.scan
-        self._obstacles = Obstacles(geometry, config.obstacles, dense)  # seen at keyframes
-        self.floor = self._obstacles.floor
+        self._obstacles = Obstacles(geometry, config.obstacles)  # seen at keyframes
+        self._T_floor_rig = floor_frame(geometry.rig, self._limits.floor_m)
         self.state = MapState.ODOMETRY_ONLY  # state of the newest pose
         self.counts = self._localiser.counts  # sizes and counters of the map
         self._copied_scans: object = None  # scans of the map at the last copy of counts and keyframes
@@ -222,34 +222,31 @@ class Places:
 
     def _ranges(self, odometry: OdometryUpdate) -> tuple[RangeScan, FreeRanges]:
         """Return the range scan of a pair, and up to where floor was seen."""
-        dense = self._dense.of(odometry.depth)
-        self.floor.add(dense)
         scan = self._obstacles.scan(odometry)
-        return keyframe_ranges(dense, scan, self.floor, self._T_rig_rect, self._limits)
+        return keyframe_ranges(self._dense.of(odometry.depth), scan, self._T_floor_rig, self._T_rig_rect, self._limits)
 
 
 def keyframe_ranges(
     depth: DensePoints,
     scan: ObstacleScan,
-    camera_floor: CameraFloor,
+    T_floor_rig: Array | None,
     T_rig_rect: Array,
     settings: ScanSettings,
 ) -> tuple[RangeScan, FreeRanges]:
     """Return the ranges of a keyframe and up to where its floor is free, (SECTORS,) by azimuth in the rectified frame.
 
     The frame is turned level, with its origin on the floor below the lower viewpoint. scan: obstacles at the keyframe.
+    T_floor_rig: see floor_frame.
     """
-    floor = camera_floor.floor
-    if floor is None:
+    if T_floor_rig is None:
         return np.full(SECTORS, np.nan, np.float32), np.zeros(SECTORS, np.float32)
     # 1. The level frame below the lower viewpoint, with the heading of the rectified frame.
-    T_floor_rig = camera_floor.T_floor_rig(floor)
     T_floor_rect = T_floor_rig @ T_rig_rect
     heading = se3.rotation_exp(np.array([0.0, 0.0, float(se3.yaw(T_floor_rect))]))
     T_level_floor = se3.inverse(se3.transform(heading, np.array([*T_floor_rect[:2, 3], 0.0])))
     # 2. The nearest obstacles by stereo.
     points, view = se3.apply(T_level_floor @ T_floor_rig, depth.points), np.array([0.0, 0.0, T_floor_rect[2, 3]])
     limits = settings.heights_m, math.radians(settings.tilt_deg), settings.min_points
-    ranges = point_scan(points, np.sqrt(depth.variance_m2), view, *limits, floor.sigma_m)
+    ranges = point_scan(points, np.sqrt(depth.variance_m2), view, *limits)
     # 3. The free floor by the obstacle scan.
     return ranges, np.minimum(seen_from(scan.free_m, T_level_floor), np.float32(MAX_RANGE_M))

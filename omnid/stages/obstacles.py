@@ -1,4 +1,4 @@
-"""Obstacles of a run: the floor, the grid around the base at each pair, and the scan that is published."""
+"""Obstacles of a run: the floor that the rig states, the grid around the base at each pair, and the published scan."""
 
 from __future__ import annotations
 
@@ -17,55 +17,33 @@ from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
 from omnid.core import frames
 from omnid.core.control.collision_monitor import ControllerScan, MovingPoint
-from omnid.core.floor import Floor, FloorEstimator
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.ray_scans import RayScans
 from omnid.core.stereo.tiles import TILE_COLUMNS, tile_columns
-from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate
-from omnid.stages.geometry import DenseDepths, Geometry
+from omnid.messages import ObstacleScan, OdometryUpdate
+from omnid.stages.geometry import Geometry
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FLOOR_WARNING: Final = (
-    "the rig states no height of the cameras: the floor is looked for in the images, and map, grid and obstacles call "
-    "nothing free before it is found; state it by `omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
+    "the rig states no height of the cameras: map, grid and obstacles know nothing, and call nothing free; state it by "
+    "`omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
 )
 
 
-class CameraFloor:
-    """The floor below the cameras; each stage has its own, independent of the order of threads."""
+def floor_frame(rig: Rig, floor_m: float) -> Array | None:
+    """Return the transform T_floor_rig (4, 4) from the rig to the base frame moved in z, with the floor at z = 0.
 
-    def __init__(self, rig: Rig, floor_m: float) -> None:
-        """floor_m: height of the floor in the base frame (obstacles.scan.floor_m)."""
-        self._T_base_rig = rig.T_base_rig
-        self.view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]  # (3,) in the base frame
-        height_m = rig.height_m(floor_m)
-        self.stated = None if height_m is None else Floor(height_m)
-        self._estimator = FloorEstimator()
-
-    @property
-    def floor(self) -> Floor | None:
-        """The floor as it is known now; None: nothing may be called free."""
-        return self.stated or self._estimator.floor
-
-    @property
-    def wants_points(self) -> bool:
-        """True as long as `add` may change the floor."""
-        return self.stated is None and not self._estimator.is_final
-
-    def add(self, depth: DensePoints) -> None:
-        """Search for the floor in the points of a pair, where the rig does not state its height."""
-        if self.wants_points:
-            points = se3.apply(self._T_base_rig, depth.points) - self.view
-            self._estimator.add(points, depth.variance_m2)
-
-    def T_floor_rig(self, floor: Floor) -> Array:
-        """Return the transform (4, 4) from the rig to the level frame of the base, with the floor at z = 0."""
-        return np.asarray(floor.T_floor_base(self.view) @ self._T_base_rig)
+    floor_m: height of the floor in the base frame (obstacles.scan.floor_m). None: the rig states no height, so nothing
+    may be called free.
+    """
+    if rig.height_m(floor_m) is None:
+        return None
+    return np.asarray(se3.transform(np.eye(3), np.array([0.0, 0.0, -floor_m])) @ rig.T_base_rig)
 
 
 # Scan of a pair while the floor is not known.
@@ -92,12 +70,11 @@ def sectors_of(tiles: Flags, cylinder: Cylinder, T_base_rect: Array, ranges_m: S
 class Obstacles:
     """Makes a scan of each pair that is due: the obstacle grid of a run, and the obstacles that move in it."""
 
-    def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths) -> None:
-        """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""
-        self._geometry, self._dense = geometry, dense
+    def __init__(self, geometry: Geometry, config: ObstaclesConfig) -> None:
+        self._geometry = geometry
         self._period_ns = NS_PER_S / config.rate_hz if config.rate_hz else 0.0
-        self.floor = CameraFloor(geometry.rig, config.scan.floor_m)
-        self._tables_floor: Floor | None = None  # floor for which the tables of the scans were made
+        self._T_floor_rig = floor_frame(geometry.rig, config.scan.floor_m)
+        self._has_tables = False  # of the floor, which the visible pixels of the first pair make
         self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, config.scan)
         self._tracker = MovingTracker()
         self._T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
@@ -108,19 +85,14 @@ class Obstacles:
 
     def process(self, odometry: OdometryUpdate) -> ObstacleScan | None:
         """Return the scan at a pair, None where it is not due."""
-        # 1. At the rate of the configuration; stamps that step back are of another part of a log.
+        # At the rate of the configuration; stamps that step back are of another part of a log.
         if self._last_ns is not None and 0 <= odometry.stamp_ns - self._last_ns < self._period_ns - STAMP_JITTER_NS:
             return None
         self._last_ns = odometry.stamp_ns
-        # 2. The floor, from points of pairs whose pose is known, until it is known.
-        if self.floor.wants_points and odometry.state is not TrackingState.LOST:
-            # As they were matched: the fit leaves out by itself what is no floor.
-            self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
-        # 3. The scan.
         return self.scan(odometry)
 
     def scan(self, odometry: OdometryUpdate) -> ObstacleScan:
-        """Add the evidence of a pair; return the scan at it, which is unknown while the floor or the pose is."""
+        """Add the evidence of a pair; return the scan at it, which is unknown where the floor or the pose is."""
         # 1. Forget the grid and the tracks where odometry has begun again; while it is lost the grid is kept: it is
         #    valid again once odometry recognises its landmarks.
         is_lost = odometry.state is TrackingState.LOST
@@ -135,12 +107,11 @@ class Obstacles:
         unwatched = sectors_of(tiles.unknown, cylinder, self._T_base_rect, self._ranges_m)
         unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         # 2. Tables of the floor.
-        floor = self.floor.floor
-        if is_lost or floor is None:
+        if is_lost or self._T_floor_rig is None:
             return unknown
-        if floor is not self._tables_floor:
-            self._tables_floor = floor
-            T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(self.floor.T_floor_rig(floor))
+        if not self._has_tables:
+            self._has_tables = True
+            T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(self._T_floor_rig)
             self.scans.set_floor(T_rect_floor, panoramas.visible)
         # 3. The scan by the images, without their dead and blind parts.
         lost = tiles.lost_pixels(panoramas.visible.shape)

@@ -62,22 +62,20 @@ def point_scan(
     heights_m: tuple[float, float],
     tilt_rad: float,
     min_points: int,
-    floor_sigma_m: float = 0.0,
 ) -> RangeScan:
     """Return the scan (SECTORS,) of points (N, 3) [m] in the level frame of the base; z is the height above the floor.
 
     A range is that of the nearest obstacle up to MAX_RANGE_M, m; NaN: unknown.
 
     sigma_m (N,): of the points, along the rays; view (3,): the viewpoint in that frame; heights_m: of obstacles above
-    the floor; tilt_rad: sigma of the base's tilt against it; min_points: least number of points of an obstacle;
-    floor_sigma_m: of the height of the floor.
+    the floor; tilt_rad: sigma of the base's tilt against it; min_points: least number of points of an obstacle.
     """
     # 1. The points within the band of heights, by a margin of two sigma for the noise of stereo and the tilt of the
     #    base: 2 % of the points of the floor are beyond it.
     low, high = heights_m
     across2, rise2 = ((points[:, :2] - view[:2]) ** 2).sum(axis=1), (points[:, 2] - view[2]) ** 2
     stereo_variance = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
-    margin = 2 * np.sqrt(stereo_variance + tilt_rad**2 * across2 + floor_sigma_m**2)
+    margin = 2 * np.sqrt(stereo_variance + tilt_rad**2 * across2)
     x, y, z = points.T
     ranges = np.hypot(x, y)
     chosen = (ranges > NEAREST_M) & np.isfinite(sigma_m) & (z - margin > low) & (z + margin < high)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator, fit_floor
+from omnid.core.floor import Floor, common_floor, fit_floor
 
-HEIGHT_M = 1.2
+HEIGHT_M, PAIRS = 1.2, 12
 Points = tuple[np.ndarray, np.ndarray]
 
 
@@ -76,28 +76,22 @@ def test_a_table_above_the_floor_is_not_the_floor() -> None:
     ids=["walls only", "in a quarter of the directions", "few", "none", "a ceiling"],
 )
 def test_without_a_floor_that_is_seen_there_is_none(points: object) -> None:
-    rng, estimator = np.random.default_rng(4), FloorEstimator()
-    for _ in range(MOST_PAIRS):
-        estimator.add(*noisy(points(rng), rng))  # type: ignore[operator]
-    assert estimator.floor is None
+    rng = np.random.default_rng(4)
+    assert common_floor(noisy(points(rng), rng) for _ in range(PAIRS)) is None  # type: ignore[operator]
 
 
 def test_weak_evidence_of_pairs_adds_up() -> None:
-    rng, estimator = np.random.default_rng(5), FloorEstimator()
-    known = []
-    for _ in range(MOST_PAIRS):
-        estimator.add(*noisy(np.vstack([plane(90, rng), walls(4000, rng)]), rng))
-        known.append(estimator.floor is not None)
-    assert not known[0] and known[-1]
-    assert estimator.floor is not None and abs(estimator.floor.height_m - HEIGHT_M) < 0.03
+    rng = np.random.default_rng(5)
+    pairs = [noisy(np.vstack([plane(90, rng), walls(4000, rng)]), rng) for _ in range(PAIRS)]
+    floor = common_floor(pairs)
+    assert common_floor(pairs[:1]) is None and floor is not None and abs(floor.height_m - HEIGHT_M) < 0.03
 
 
 def test_pairs_that_contradict_one_another_show_no_floor() -> None:
-    rng, estimator = np.random.default_rng(6), FloorEstimator()
-    for k in range(MOST_PAIRS):
-        height_m = 0.8 + 0.1 * (k % 5)
-        estimator.add(*noisy(np.vstack([plane(1500, rng, height_m), walls(500, rng, low_m=-height_m)]), rng))
-    assert estimator.is_final and estimator.floor is None
+    rng = np.random.default_rng(6)
+    heights_m = [0.8 + 0.1 * (k % 5) for k in range(PAIRS)]
+    seen = [np.vstack([plane(1500, rng, height_m), walls(500, rng, low_m=-height_m)]) for height_m in heights_m]
+    assert common_floor(noisy(points, rng) for points in seen) is None
 
 
 def test_the_level_frame_has_the_floor_at_zero() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from calib import se3
+from calib.rig_file import read_rig
 from omnid.config import ObstaclesConfig, load_config
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.grid import FREE, OCCUPIED, REACH_CELLS, UNKNOWN
@@ -22,7 +22,7 @@ from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import keyframe_ranges
-from omnid.stages.obstacles import CameraFloor, Obstacles, sectors_of
+from omnid.stages.obstacles import Obstacles, floor_frame, sectors_of
 from omnid.tracking_state import TrackingState
 from tests.omnid.core import test_floor
 from tests.omnid.core.obstacles.drawn_floor import (
@@ -56,7 +56,8 @@ class Scans:
 def scans_of(scene: Path) -> list[ObstacleScan]:
     """Return the scans of a rendered run."""
     found, config = Scans(), load_config(None, ["places.enabled=false"])
-    run_log(scene / "log.mcap", config, ReplayOptions(rig=scene / "rig.toml", inline=True, observer=lambda *_: found))
+    rig = read_rig(scene / "rig.toml").at_height(test_floor.HEIGHT_M)
+    run_log(scene / "log.mcap", config, ReplayOptions(rig=rig, inline=True, observer=lambda *_: found))
     return found.scans
 
 
@@ -80,8 +81,7 @@ class Standing:
     def __init__(self, height_m: float, ahead_m: float = 0.0) -> None:
         T_base_rig = se3.transform(np.eye(3), [ahead_m, 0.0, height_m])
         rig = replace(make_rig(baseline_m=BASELINE_M), T_base_rig=T_base_rig)
-        dense: Any = None  # the rig states the floor
-        self.obstacles, self._seq = Obstacles(Geometry(rig, CYLINDER), ObstaclesConfig(), dense), 0
+        self.obstacles, self._seq = Obstacles(Geometry(rig, CYLINDER), ObstaclesConfig()), 0
 
     def scan(
         self,
@@ -188,12 +188,12 @@ UNKNOWN_M = np.full(SECTORS, np.nan, np.float32)
 NOTHING = ObstacleScan(0, 0, UNKNOWN_M, UNKNOWN_M, np.zeros(SECTORS, np.float32), np.eye(4))
 
 
-def depth(T_rig_level: np.ndarray, with_floor: bool = True) -> DensePoints:
+def depth(T_rig_level: np.ndarray) -> DensePoints:
     """Return the points of a room in the rig frame: a wall, the floor, and a box 0.4 m high ahead with a tenth of the
     points that the wall above it has.
     """
     rng = np.random.default_rng(1)
-    parts = [walls(30_000, rng, WALL_M), plane(3000 if with_floor else 0, rng)]
+    parts = [walls(30_000, rng, WALL_M), plane(3000, rng)]
     parts[0] = parts[0][(np.abs(np.arctan2(parts[0][:, 1], parts[0][:, 0])) > 0.3) | (parts[0][:, 2] > -0.7)]
     angle = rng.uniform(-0.3, 0.3, 250)
     low = np.column_stack(
@@ -203,22 +203,17 @@ def depth(T_rig_level: np.ndarray, with_floor: bool = True) -> DensePoints:
     return DensePoints(np.zeros((0, 0), np.float32), np.zeros((0, 2)), points, 1e-4 * (points**2).sum(axis=1) ** 2)
 
 
-@pytest.mark.parametrize("height_m", [ROOM_HEIGHT_M, 0.0], ids=["stated", "not stated"])
 @pytest.mark.parametrize("tilt_deg", [0.0, 0.8])
-def test_a_low_box_before_a_wall_is_the_nearest_obstacle(height_m: float, tilt_deg: float) -> None:
+def test_a_low_box_before_a_wall_is_the_nearest_obstacle(tilt_deg: float) -> None:
     tilt = se3.transform(se3.rotation_exp(np.deg2rad([0.0, tilt_deg, 0.0])), np.zeros(3))
-    stated = se3.transform(np.eye(3), [0.0, 0.0, height_m])
-    # A stated pose holds the tilt as well.
-    rig = replace(make_rig(), T_base_rig=stated @ se3.inverse(tilt) if height_m else np.eye(4))
-    camera_floor, seen = CameraFloor(rig, 0.0), depth(tilt)
-    camera_floor.add(seen)
-    scan, _ = keyframe_ranges(seen, NOTHING, camera_floor, np.eye(4), ScanSettings())
+    stated = se3.transform(np.eye(3), [0.0, 0.0, ROOM_HEIGHT_M])
+    rig = replace(make_rig(), T_base_rig=stated @ se3.inverse(tilt))  # a stated pose holds the tilt as well
+    scan, _ = keyframe_ranges(depth(tilt), NOTHING, floor_frame(rig, 0.0), np.eye(4), ScanSettings())
     np.testing.assert_allclose(scan[AHEAD], BOX_M, atol=0.08)
     np.testing.assert_allclose(scan[np.abs(azimuths()) > 0.5], WALL_M, atol=0.15)
 
 
-def test_without_a_floor_nothing_is_known_and_the_summary_names_it() -> None:
-    camera_floor, seen = CameraFloor(make_rig(), 0.0), depth(np.eye(4), with_floor=False)
-    camera_floor.add(seen)
-    scan, _ = keyframe_ranges(seen, NOTHING, camera_floor, np.eye(4), ScanSettings())
+def test_without_a_height_nothing_is_known() -> None:
+    floor = floor_frame(make_rig(), 0.0)
+    scan, _ = keyframe_ranges(depth(np.eye(4)), NOTHING, floor, np.eye(4), ScanSettings())
     assert np.isnan(scan).all()
