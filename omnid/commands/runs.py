@@ -147,7 +147,7 @@ def replay(args: argparse.Namespace) -> int:
     --method default|paper [odometry.method]   paper: the odometry of the paper on its enhanced SAD, for comparison
     --tracker improved|klt [odometry.tracker]  feature tracker of the paper's method
     --inline    one thread, one pair after the other; same results
-    --realtime  at the speed of the recording; late messages are dropped
+    --realtime  at the speed of the recording, where the computer is fast enough
 
     examples:
       replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png
@@ -162,7 +162,6 @@ def replay(args: argparse.Namespace) -> int:
         topics=(args.lower, args.upper),
         span_s=(args.start_s, math.inf if args.seconds is None else args.start_s + args.seconds),
         paced=args.realtime,
-        drops=args.realtime,
         settings=args.config,
     )
     if args.rerun is None:

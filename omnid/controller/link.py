@@ -55,7 +55,6 @@ class ControllerStatistics:
         self.lateness.add(tick.late_s)
         self._stats.wall.add(tick.work_s)
         self._stats.processed += 1
-        self._stats.dropped = tick.state.missed
         self._stats.busy_since_ns = time.monotonic_ns()
 
     def close(self) -> None:

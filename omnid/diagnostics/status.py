@@ -22,7 +22,7 @@ from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILE
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES, Side
-from omnid.engine.graph import Histogram, StageStats, Telemetry
+from omnid.engine.graph import Histogram, Telemetry
 from omnid.engine.logging_setup import HANDLER
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import OdometryUpdate
@@ -211,8 +211,12 @@ class StatusCollector:
         found |= {f"{status_names.PREFIX}{name} camera": self._camera(name) for name in self._cameras}
         found |= {name: stats() for name, stats in self._parts.items()}
         for stage in self._telemetry.stages:
-            rate_hz = self._rate_hz(stage.name, stage.processed)
-            found[status_names.stage_name(stage.name)] = stage_stats(stage, rate_hz)
+            found[status_names.stage_name(stage.name)] = {
+                Key.RATE_HZ: self._rate_hz(stage.name, stage.processed),
+                Key.PROCESSED: stage.processed,
+                Key.DROPPED: stage.dropped,
+                **times(status_names.WORK, stage.wall),  # for a message
+            }
         return [entry(name, stats) for name, stats in found.items()]
 
     def _rate_hz(self, name: str, count: int) -> float:
@@ -296,10 +300,10 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
     is_unwanted = slow or stop not in ("", IDLE, ASKED, COMMAND_STALE, STARTED)
     severity = "_error" if has_failed else "_warning" if is_unwanted else "_words"
     # 2. The numbers.
-    counts = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "obstacle", "problem", "measured", "battery_v")
+    counts = ("sent", "late", "missed", Key.ERRORS, Key.EXPIRIES, "fault", "obstacle", "problem")
     arm = "send cmd/arm: `omnid arm`" if state.needs_request else ""
     return {
-        **{key: getattr(state, key) for key in counts},
+        **{key: getattr(state, key) for key in (*counts, "measured", "battery_v")},
         **by_reason(status_names.STOPPED_PREFIX, state.stops),
         **by_reason(status_names.IGNORED_PREFIX, state.refused),
         "commands": commands.wheels.accepted,
@@ -314,13 +318,6 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         Key.SOURCE: state.source,
         severity: words,
     }
-
-
-def stage_stats(stage: StageStats, rate_hz: float = math.nan) -> Stats:
-    """Return the numbers of a stage: work is the time for a message."""
-    lost = Key.MISSED if stage.is_ticker else Key.DROPPED
-    work = times(status_names.WORK, stage.wall)
-    return {Key.RATE_HZ: rate_hz, Key.PROCESSED: stage.processed, lost: stage.dropped, **work}
 
 
 def rig_stats(health: RigHealth) -> Stats:

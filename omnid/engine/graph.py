@@ -101,14 +101,13 @@ class Histogram:
 
 @dataclass(slots=True)
 class StageStats:
-    """Counters of one stage, source, sink or ticker: written by its own thread, `dropped` under its inbox's lock.
+    """Counters of one stage, source or sink: written by its own thread, `dropped` under its inbox's lock.
 
-    A source's durations are the waits for its next message; a ticker's `dropped` are missed deadlines.
-    `busy_since_ns` (CLOCK_MONOTONIC): since when a message is processed, or a ticker acts; 0 when idle.
+    A source's durations are the waits for its next message. `busy_since_ns` (CLOCK_MONOTONIC): since when a message is
+    processed; 0 when idle.
     """
 
     name: str
-    is_ticker: bool = False
     processed: int = 0
     dropped: int = 0
     busy_since_ns: int = 0
@@ -141,10 +140,6 @@ class Telemetry:
     def of(self, name: str) -> StageStats:
         """Return the counters of a stage; StopIteration without it."""
         return next(stats for stats in self.stages if stats.name == name)
-
-    def lost(self, *, by_tickers: bool) -> int:
-        """Return the number of messages that were dropped in front of stages and sinks, or of missed deadlines."""
-        return sum(stats.dropped for stats in self.stages if stats.is_ticker == by_tickers)
 
     def summary(self) -> dict[str, dict[str, float]]:
         """Return n (messages), drops, p50_ms, p99_ms and max_ms (time of one, NaN without any) by stage."""

@@ -32,7 +32,6 @@ GOOD, WARNING, ERROR = range(len(LEVELS))
 _COUNTERS: Final[Mapping[str, str]] = {  # of faults, with the text of the event when one rises
     Key.DROPS: "images dropped",
     Key.DROPPED: "messages dropped",
-    Key.MISSED: "deadlines missed",
     Key.ERRORS: "errors",
     Key.LOSSES: "camera lost",
     Key.RESTARTS: "stream restarted",

@@ -198,10 +198,10 @@ def _sections(run: RecordedRun, true: Trajectory | None) -> Iterator[tuple[str, 
     stages = {name.removeprefix(STAGE_PREFIX): run.values(name) for name in run.newest if name.startswith(STAGE_PREFIX)}
     rows = []
     for name, values in stages.items():
-        lost = values.get(Key.DROPPED, values.get(Key.MISSED, ""))
         times = (_rounded(values.get(time_key(WORK, statistic), "")) for statistic in ("p50", "p99", "max"))
-        rows.append((name, values.get(Key.PROCESSED, ""), values.get(Key.RATE_HZ, ""), lost, *times))
-    titles = ("stage", "messages", "per second, last", "dropped or missed", "p50 ms", "p99 ms", "max ms")
+        counts = (values.get(key, "") for key in (Key.PROCESSED, Key.RATE_HZ, Key.DROPPED))
+        rows.append((name, *counts, *times))
+    titles = ("stage", "messages", "per second, last", "dropped", "p50 ms", "p99 ms", "max ms")
     latency = {"median": "p50", "99th percentile": "p99"}
     curves = [run.curve(name, ODOMETRY, time_key(CAPTURE_TO_POSE, p)) for name, p in latency.items()]
     figures = [

@@ -348,8 +348,8 @@ class Service:
         # 2. State, and what was lost.
         has_new, self._poses = found.poses > self._poses, found.poses
         state = found.newest.state if found.newest is not None and has_new else "waiting for images"
-        dropped, late = self._telemetry.lost(by_tickers=False), self._telemetry.lost(by_tickers=True)
-        line = f"{found.length_m:.2f} m, {state}, {dropped} messages dropped, {late} ticks late"
+        dropped = sum(stage.dropped for stage in self._telemetry.stages)
+        line = f"{found.length_m:.2f} m, {state}, {dropped} messages dropped"
         line = f"stalled: {', '.join(stalled)}" if stalled else line
         HANDLER.show(line)
         notify("READY=1", *([] if stalled else ["WATCHDOG=1"]), f"STATUS={one_line(line)}")

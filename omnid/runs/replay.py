@@ -24,7 +24,7 @@ from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
-from omnid.diagnostics.status import RunCounters, RunStatistics, input_warnings, pair_loss, stage_stats
+from omnid.diagnostics.status import RunCounters, RunStatistics, input_warnings, pair_loss
 from omnid.engine.graph import POLL_S, Graph, Sink, sleep_until
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.errors import OmnidError
@@ -42,10 +42,8 @@ from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_t
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.obstacles import FLOOR_WARNING
-from omnid.stages.synchronise import MotionInbox
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport.codec import Diagnostics
-from omnid.transport.status_names import MOTION, entry, stage_name
+from omnid.transport.status_names import MOTION, entry
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 
@@ -66,7 +64,6 @@ class ReplayOptions:
     publish: bool = False
     inline: bool = False
     paced: bool = False  # at the pace of the log's stamps, unless the computer is slower; False: as fast as possible
-    drops: bool = False  # a late stage drops messages, as on the robot; False: the stages before it wait
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     # Called ten times a second and at the end, with statistics, expected pairs, and whether the run has ended.
     progress: Callable[[RunStatistics, int | None, bool], object] | None = None
@@ -168,7 +165,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
     check_outputs(options.files, [(f"the {what} that is read", path) for what, path in named if isinstance(path, Path)])
     if options.map_tum and not config.places.enabled:
         raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
-    graph = Graph(drops=options.drops, threaded=not options.inline)
+    graph = Graph(threaded=not options.inline)
     with ExitStack() as closing:
         # 2. The log and its rig; compiling may take a minute, so that a log or a rig that is wrong is refused first.
         warnings = list[str]()
@@ -219,7 +216,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         if options.publish:
             bus = BusSink(session.open_bus(rig, gives_time=True), session.encoder(rig), clock=OdometryUpdate)
         outputs = replace(outputs, bus=bus, recorder=options.observer(front_end) if options.observer else recorder)
-        paced = partial(_paced, reader, graph, front_end.pairing.motion)
+        paced = partial(_paced, reader, graph)
         messages = graph.source("read", paced if options.paced else reader.messages)
         inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
         stages = wire(config, inputs, front_end, graph, outputs)
@@ -237,7 +234,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
         drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
         drops["broken"] += paired["broken"]
-        drops["queue"] = graph.telemetry.lost(by_tickers=False)
         counters = RunCounters(
             paired["pairs"],
             found.poses,
@@ -247,13 +243,9 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             drops,
             {} if stages.places is None else stages.places.counts,
             {} if wheels is None else wheels.counts(),
-            "" if drops["queue"] else pair_loss(front_end.pairing, read),  # else they were dropped on purpose
+            pair_loss(front_end.pairing, read),
         )
-        if recorder is not None and recorder.state.messages:
-            statuses = [entry(stage_name(stage.name), stage_stats(stage)) for stage in graph.telemetry.stages]
-            if front_end.pairing.motion.wheels or front_end.pairing.motion.gyro:
-                statuses.insert(0, entry(MOTION, front_end.motion_stats()))
-            recorder.process(Diagnostics(recorder.newest_ns, tuple(statuses)))
+        if recorder is not None:
             recorder.close()
 
         # 5. Poses in the map: corrected by its later loops, and as they were known while driving.
@@ -283,17 +275,14 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         )
 
 
-def _paced(reader: LogReader, graph: Graph, motion: MotionInbox) -> Iterator[Frame]:
-    """Yield the log's frames when their stamps are due; samples go to their own inbox, as they would replace frames."""
+def _paced(reader: LogReader, graph: Graph) -> Iterator[Frame | MotionSample]:
+    """Yield the messages of a log when their stamps are due."""
     offset_ns: int | None = None
     for message in reader.messages():
         if offset_ns is None:
             offset_ns = time.monotonic_ns() - message.stamp_ns
         sleep_until(message.stamp_ns + offset_ns, lambda: graph.is_stopping)
-        if isinstance(message, MotionSample):
-            motion.add(message)
-        else:
-            yield message
+        yield message
 
 
 def _run_warnings(

@@ -135,7 +135,7 @@ class Session:
         elif not self.config.obstacles.enabled:
             settings = settings.without_obstacles
         start = ControllerStart(self.config.motor, settings, realtime, waits=of_replay)
-        link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor", is_ticker=True)), self.warn)
+        link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
         self.outputs.callback(link.close)
         return link
 

@@ -52,7 +52,7 @@ class PacedRobot:
             lambda _, line: self._report(line),
             self._start_ns,
         )
-        self._ticks = StageStats("motor", is_ticker=True)
+        self._ticks = StageStats("motor")
         self.statistics = ControllerStatistics(self._ticks)
         self._commands: SimpleQueue[VelocityCommand | None] = SimpleQueue()  # None: the end
         self._contact = NO_CONTACT

@@ -53,8 +53,7 @@ class Recorder:
     In a live run its inbox drops, so that no stage waits for the disk, and its log, a RotatingLog, never raises.
     A replay loses nothing: a message that cannot be written raises DriverError.
 
-    Without an encoder only frames are recorded. The caller that runs the graph closes the recorder after the last
-    message. newest_ns: latest stamp of the messages.
+    Without an encoder only frames are recorded. The caller that runs the graph closes the recorder.
     """
 
     def __init__(
@@ -75,7 +74,6 @@ class Recorder:
         self._steps = self._clock.steps
         self._period_ns, self._period_index = round(NS_PER_S / images_hz) if images_hz else 1, -1
         self._file_count = 0
-        self.newest_ns = 0
 
     @property
     def state(self) -> RotatingLogState:
@@ -109,7 +107,6 @@ class Recorder:
         for frame in frames:
             frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
             self._write([(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
-        self.newest_ns = max(self.newest_ns, stamp_ns)
 
     def close(self) -> None:
         """Complete the last file; a second call does nothing."""

@@ -72,7 +72,6 @@ class Key(StrEnum):
     # Stages, cameras and pairing
     PROCESSED = "processed"
     DROPPED = "dropped"  # messages
-    MISSED = "missed"  # deadlines of a ticker
     DROPS = "drops"
     ERRORS = "errors"
     LOSSES = "losses"

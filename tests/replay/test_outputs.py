@@ -35,7 +35,7 @@ from omnid.settings import parse
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
-from omnid.transport.codec import decode_diagnostics, decode_map, decode_pose
+from omnid.transport.codec import decode_map, decode_pose
 from omnid.transport.status_names import ODOMETRY, WHEELS, stage_name
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
@@ -125,7 +125,6 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
         counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
-        last = [decode_diagnostics(m.data) for _, _, m in reader.iter_messages(["/rover/status"])][-1]
         attachments = {a.name: a.data for a in reader.iter_attachments()}
         assert [
             index.offset < chunk.chunk_start_offset
@@ -139,14 +138,12 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
         "/tf": 2 * FEW_PAIRS,
         "/rover/cloud": 1,
         "/rover/map": 1,
-        "/rover/status": 3,
+        "/rover/status": 2,
         "/rover/scan": counts["/rover/scan"],
         "/rover/moving": counts["/rover/scan"],
         "/tf_static": 1,
     }
     assert counts["/rover/scan"] == FEW_PAIRS  # ten a second, as the pairs are
-    assert last.value(stage_name("odometry"), "processed") == str(FEW_PAIRS)
-    assert float(last.value(stage_name("odometry"), "work_p50_ms")) > 0.1
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"

@@ -21,7 +21,7 @@ from tests.conftest import PAIRS
 from tests.contract.simulated_controllers import PtyMotor
 from tests.ply import read_ply
 from tests.ports import free_port
-from tests.replay.command import Command, Result, rows
+from tests.replay.command import Command, rows
 from tests.replay.edited import images, save
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -91,8 +91,7 @@ def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, 
     assert 3 <= written < PAIRS and len(read_ply(ply).xyz) > 0
     with log.open("rb") as file:
         recorded = sum(1 for _ in make_reader(file).iter_messages(["/omnid/odom"]))
-    # In real time a recorder that is late drops messages, and says so; nothing else is missing.
-    assert written - Result(process.returncode, out, err).count("queue") <= recorded <= written
+    assert recorded == written
 
 
 def test_the_ten_lines_of_the_document_hear_a_robot_without_omnid(scene: Path) -> None:
