@@ -118,9 +118,8 @@ def doctor(args: argparse.Namespace) -> int:
         checks.cameras({name: camera.settings(name) for name in SIDES}, capture_devices(ROOT), ROOT),
         checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.scan.floor_m),
         checks.motor(config.motor, ROOT),
-        checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory),
         checks.disk(checks.STATE / config.record.folder, config.record, rate),
-        [checks.bus(config.bus)],
+        [checks.rights(max(wanted.motor_priority, wanted.capture_priority)), checks.bus(config.bus)],
     ):
         print(finding, flush=True)
         found.append(finding)

@@ -43,9 +43,8 @@ def run_controller(channel: Channel) -> int:
         except DriverError as error:
             channel.send(StartFailed(str(error)))
             return 2
-        # Memory, garbage collection and priority, for punctual ticks. What `prepare` is refused, the daemon was refused
-        # too, and logs it.
-        prepare(start.realtime)
+        # Memory, garbage collection and priority, for punctual ticks.
+        prepare()
         refused: list[str] = []
         start_thread({THREAD_NAME: start.realtime.motor_priority}, lambda _, line: refused.append(line), THREAD_NAME)
         channel.send(LogRecord(" ".join(refused)))

@@ -20,7 +20,7 @@ from drivers.errors import DriverError
 from drivers.motors.serial_motor import motor_protocol
 from omnid.config import RecordConfig
 from omnid.controller.motor import SIMULATED, MotorSettings
-from omnid.engine.process import LOCK_ADVICE, PRIORITY_ADVICE, highest_priority, may_lock
+from omnid.engine.process import PRIORITY_ADVICE, highest_priority
 from omnid.errors import OmnidError
 from omnid.transport.session import BusConfig, zenoh_config
 
@@ -89,18 +89,13 @@ def access(subject: str, device: Path) -> Finding | None:
     return Finding("error", subject, f"no permission for {device}", join)
 
 
-def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
-    """Check that this user may have the real-time priority, and may lock memory."""
-    highest, locks = highest_priority(), may_lock() or not lock_memory
+def rights(priority: int) -> Finding:
+    """Check that this user may have the real-time priority."""
+    highest = highest_priority()
     allowed = f"priorities up to {highest} are allowed"
     if priority > highest:
-        yield Finding("warning", "real time", allowed, PRIORITY_ADVICE)
-    else:
-        yield Finding("ok", "real time", allowed)
-    if locks:
-        yield Finding("ok", "memory", "may be locked, or need not be")
-    else:
-        yield Finding("warning", "memory", "this user may not lock memory; the unit sets LimitMEMLOCK", LOCK_ADVICE)
+        return Finding("warning", "real time", allowed, PRIORITY_ADVICE)
+    return Finding("ok", "real time", allowed)
 
 
 def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Finding]:

@@ -26,7 +26,6 @@ from typing import Annotated, Any, Final
 from msgspec import Meta
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, the service manager, a closed terminal
-LOCK_ADVICE: Final = "set LimitMEMLOCK=infinity in the unit, or realtime.lock_memory = false"
 PRIORITY_ADVICE: Final = (
     "raise LimitRTPRIO in the unit, or set realtime.motor_priority and realtime.capture_priority to 0"
 )
@@ -35,27 +34,24 @@ _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 @dataclass(frozen=True, slots=True)
 class RealtimeSettings:
-    """Requests to the kernel and to Python, so that deadlines hold."""
+    """Requests to the kernel, so that deadlines hold."""
 
-    lock_memory: Annotated[bool, "lock all memory against swapping; needs LimitMEMLOCK=infinity"] = True
     motor_priority: Annotated[
         int, Meta(ge=0, le=99), "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none"
     ] = 20
     capture_priority: Annotated[int, Meta(ge=0, le=99), "SCHED_FIFO priority of the capture threads; 0: none"] = 10
 
 
-def prepare(settings: RealtimeSettings) -> str:
-    """Apply the settings of the process, after the wiring and before the run; return what is refused, else "".
+def prepare() -> None:
+    """Prepare the process for punctual threads, after the wiring and before the run.
 
-    Under a limit no memory is locked: allocations beyond it would fail.
+    All memory is locked where that has no limit (LimitMEMLOCK=infinity): under one, later allocations would fail.
     """
     sys.setswitchinterval(1e-3)
     gc.collect()
     gc.freeze()  # what exists at the start is not examined again
-    # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT; without the last one, untouched stacks take 400 MB.
-    if not settings.lock_memory or (may_lock() and _LIBC.mlockall(1 | 2 | 4) == 0):
-        return ""
-    return f"memory is not locked, it may be swapped out: {LOCK_ADVICE}"
+    if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY:
+        _LIBC.mlockall(1 | 2 | 4)  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: else untouched stacks would take 400 MB
 
 
 def start_thread(priorities: Mapping[str, int], report: Callable[[int, str], object], name: str) -> None:
@@ -70,11 +66,6 @@ def start_thread(priorities: Mapping[str, int], report: Callable[[int, str], obj
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
         except OSError:
             report(logging.WARNING, f"thread '{name}' cannot have real-time priority {priority}: {PRIORITY_ADVICE}")
-
-
-def may_lock() -> bool:
-    """True if this process may lock any amount of memory."""
-    return os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
 
 
 def highest_priority() -> int:

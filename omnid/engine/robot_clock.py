@@ -39,7 +39,7 @@ class RobotClock:
         self._following = Lock()
         # Stamps from which on an offset is in force [ns], with the offset.
         self._offsets = deque[tuple[float, int]]([(-math.inf, self._measured()[1])], KEPT)
-        self.steps, self._step_at_ns, self._step_s = 0, 0, math.nan
+        self.steps, self._step_at_ns = 0, 0
 
     def follow(self) -> None:
         """Measure the offset, follow it, and report a step; without a step at most once a second."""
@@ -52,7 +52,7 @@ class RobotClock:
                 self._offsets.append((now_ns, offset_ns))
             if not is_step:
                 return
-            self.steps, self._step_at_ns, self._step_s = self.steps + 1, now_ns, change_ns * S_PER_NS
+            self.steps, self._step_at_ns = self.steps + 1, now_ns
         how = f"was set {'forwards' if change_ns > 0 else 'back'} by {abs(change_ns) * S_PER_NS:.3f} s"
         self._report(f"the computer's clock {how}: stamps follow it, a recording goes on in a new file")
 
@@ -99,11 +99,6 @@ class RobotClock:
     def age_ns(self, unix_ns: int) -> int:
         """Return the time since a Unix time; below 0 where it is to come."""
         return self.monotonic_ns() - self.stamp_ns(unix_ns)
-
-    def stats(self) -> dict[str, object]:
-        """Return the number of steps, and the newest one."""
-        self.follow()
-        return {"steps": self.steps, "step_s": self._step_s}
 
 
 def log_time() -> RobotClock:

@@ -153,8 +153,8 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
             wheels = "`omnid arm` lets it drive; " if config.motor.port and config.controller.arming == MANUAL else ""
             endpoints = ", ".join(config.bus.connect if config.bus.is_client else config.bus.listen)
             report(logging.INFO, f"ready: poses at {endpoints} (`omnid listen`); {wheels}Ctrl-C ends")
-        if not robot.waits and (refused := prepare(config.realtime)):
-            warn(refused)
+        if not robot.waits:
+            prepare()
         run_to_end(graph, run_places)
     return clock
 
@@ -246,7 +246,6 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Re
         names.IMAGES: lambda: image_stats(statistics.newest),
         names.EXPOSURE: exposure.stats,
         names.RIG: partial(rig_stats, health),
-        names.CLOCK: clock.stats,
     }
     if controller is not None:
         session.parts[names.WHEELS] = partial(wheel_stats, controller.statistics, commands)

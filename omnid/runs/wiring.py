@@ -131,7 +131,7 @@ class Session:
         """
         settings, realtime = self.config.controller, self.config.realtime
         if of_replay:
-            settings, realtime = settings.of_replay, replace(realtime, lock_memory=False, motor_priority=0)
+            settings, realtime = settings.of_replay, replace(realtime, motor_priority=0)
         elif not self.config.obstacles.enabled:
             settings = settings.without_obstacles
         start = ControllerStart(self.config.motor, settings, realtime, waits=of_replay)

@@ -30,7 +30,6 @@ PAIRING: Final = f"{PREFIX}pairing"
 CAMERAS: Final = f"{PREFIX}cameras"  # the advice for both; their entries end with " camera"
 WHEELS: Final = f"{PREFIX}wheels"
 BUS: Final = f"{PREFIX}bus"
-CLOCK: Final = f"{PREFIX}clock"  # of the computer, whose steps the stamps follow
 RECORDING: Final = f"{PREFIX}recording"
 RIG: Final = f"{PREFIX}rig"
 MOTION: Final = f"{PREFIX}wheels and gyro"  # in addition to the cameras
@@ -122,7 +121,6 @@ WORDS: Final[Mapping[str, Mapping[int, Callable[[Stats], object]]]] = {
         ERROR: lambda stats: stats["same_name"] and SAME_NAME,
         OK: lambda _: "open",
     },
-    CLOCK: {OK: lambda stats: f"set by {stats['step_s']:+.3f} s: the stamps follow" if stats["steps"] else "followed"},
     RECORDING: {
         ERROR: lambda stats: stats["state"] == "stopped" and stats["problem"],
         OK: lambda stats: stats["problem"] or stats["state"],

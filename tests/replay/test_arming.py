@@ -220,9 +220,7 @@ def test_stamps_follow_the_clock_and_an_operator_drives_on_by_the_robots_own_tim
             for ahead_s in AHEAD_S:
                 daemon.write_line(f"clock {ahead_s}")
                 wait_until(lambda ahead_s=ahead_s: drives_at(ahead_s), "stamps of the new time")  # type: ignore[misc]
-            wait_until(lambda: drives_at(30) and operator.values("clock").get("steps") == "3", "the status")
             assert f"{STOPPED_PREFIX}{COMMAND_STALE}" not in operator.values("wheels")
-            assert "set by +3630" in operator.message("clock")
             # Who stamps by a clock that was not set is told why that does not count, and may arm by omnid's client.
             operator.drive()
             wait_until(lambda: "refused, too old" in operator.values("wheels"), "the refusal")

@@ -93,7 +93,7 @@ def start_message(port: object, arming: str = AUTOMATIC, *, has_scans: bool = Fa
     motor = MotorSettings(port=str(port), rate_hz=10.0, watchdog_ms=5000)
     settings = ControllerSettings(DEADLINES, limits, arming=arming, collision=CollisionSettings(stale_s=2.0))
     settings = settings if has_scans else settings.without_obstacles
-    return ControllerStart(motor, settings, RealtimeSettings(lock_memory=False))
+    return ControllerStart(motor, settings, RealtimeSettings())
 
 
 def pose(heading_rad: float = 0.0, rate_radps: float = 0.0) -> ControllerPose:
@@ -394,7 +394,7 @@ def test_ticks_keep_the_rhythm_of_the_settings() -> None:
     daemon, period_s = Channel(ours), 0.04
     with contextlib.closing(PtyMotor()) as motor, ours:
         settings = MotorSettings(port=motor.port, rate_hz=1 / period_s, watchdog_ms=5000)
-        daemon.send(ControllerStart(settings, UNATTENDED, RealtimeSettings(lock_memory=False, motor_priority=0)))
+        daemon.send(ControllerStart(settings, UNATTENDED, RealtimeSettings(motor_priority=0)))
         thread = threading.Thread(target=run_controller, args=(Channel(theirs),))
         thread.start()
         due_s: list[float] = []
