@@ -70,11 +70,11 @@ def kernels(request: pytest.FixtureRequest) -> None:
     os.environ["OMNID_CACHE_DIR"] = str(cache_folder())
     if any(item.path.parent != Path(__file__).parent for item in request.session.items):
         if why_unusable(cache_folder()):
-            prepare_kernels(lambda level, line: None)
+            prepare_kernels()
             return
         with (cache_folder() / "tests.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            prepare_kernels(lambda level, line: None)
+            prepare_kernels()
 
 
 @pytest.fixture(scope="session")

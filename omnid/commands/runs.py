@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     if args.log is None:
         if args.once or args.pace != 1.0:
             raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
-        run_live(config, ConnectedRobot(options.device_opener(config)), log)
+        run_live(config, ConnectedRobot(options.device_opener(config)))
         return 0
     return _run_log(args, replace(config, controller=config.controller.of_log))
 
@@ -77,7 +77,7 @@ def _run_log(args: argparse.Namespace, config: Config) -> int:
     if not args.rig:
         with closing(LogReader(args.log, cameras)) as reader:
             rig = attached_rig(reader, args.log)
-    run_live(config, ConnectedRobot(partial(LogCamera, playback), plays_log=True), log, rig)
+    run_live(config, ConnectedRobot(partial(LogCamera, playback), plays_log=True), rig)
     return 0
 
 
@@ -110,7 +110,7 @@ def simulate(args: argparse.Namespace) -> int:
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
     paced = PacedRobot(world, robot, config, args.seed)
-    clock = run_live(config, paced, log, paced.rig)
+    clock = run_live(config, paced, paced.rig)
     # 2. Write the truth, and report contacts.
     if args.truth:  # the poses of the base since the first one, with the stamps of the poses on the bus
         T = np.array([transform(np.array(pose)) for pose in paced.truth.values()]).reshape(-1, 4, 4)
@@ -270,5 +270,5 @@ def record(args: argparse.Namespace) -> int:
         log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
     open_camera = options.device_opener(config)
     with closing(open_camera("lower")) as lower, closing(open_camera("upper")) as upper:
-        state = record_frames({"lower": lower, "upper": upper}, config, rig, log).state
+        state = record_frames({"lower": lower, "upper": upper}, config, rig).state
     return 0 if state.messages > state.lost else 1

@@ -7,12 +7,12 @@ import shutil
 from importlib import import_module
 
 from omnid.core.compiled import DECLARED, cache_folder, code_folder, is_kept, kernel_modules, why_unusable
-from omnid.engine.logging_setup import Report, log
+from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 
 
-def prepare_kernels(report: Report = log) -> None:
-    """Compile all functions, or read them from the disk; report compilations.
+def prepare_kernels() -> None:
+    """Compile all functions, or read them from the disk; log compilations.
 
     Raises OmnidError where the code cannot be kept: a robot that compiles for a minute at each start is of no use.
     """
@@ -22,7 +22,7 @@ def prepare_kernels(report: Report = log) -> None:
     # 1. New folders for the code of files that have none, without that of their earlier states.
     missing = [name for name in modules if not is_kept(name)]
     if missing:
-        report(logging.INFO, "compiling the loops over pixels and landmarks for this processor, once; takes a minute")
+        log(logging.INFO, "compiling the loops over pixels and landmarks for this processor, once; takes a minute")
     for name in missing:
         folder = code_folder(name)
         for found in folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*"):

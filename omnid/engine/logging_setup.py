@@ -9,15 +9,12 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable
 from contextlib import suppress
-from typing import Final, TextIO, TypeAlias
+from typing import Final, TextIO
 
 from omnid.plain_text import one_line
 
 LOGGER: Final = logging.getLogger("omnid")
-
-Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
 
 _ERASE: Final = "\r\x1b[K"  # Erases the line of a terminal that the cursor is in.
 

@@ -36,7 +36,7 @@ from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import RunStatistics, StatusCollector, image_stats, rig_stats, wheel_stats
 from omnid.engine.graph import Graph, Stream, Telemetry
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.logging_setup import HANDLER, Report, log
+from omnid.engine.logging_setup import HANDLER, log
 from omnid.engine.process import prepare, start_thread
 from omnid.engine.robot_clock import RobotClock, fixed_offset
 from omnid.light.exposure import ExposureControl, UsefulArea
@@ -114,20 +114,20 @@ class ConnectedRobot:
         return frames, session.start_controller() if session.config.motor.port else None
 
 
-def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None = None) -> RobotClock:
+def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> RobotClock:
     """Run the daemon until a signal comes, or the cameras end; return its clock. rig: None for that of the settings."""
     with suppress(OSError, ValueError):  # stderr is no file
         faulthandler.enable()  # the watchdog of systemd sends SIGABRT: the stacks of all threads are printed
 
     def warn(line: str) -> None:
         was_asked = line == ARMED or names.DISARMED_BY_STOP in line
-        report(logging.INFO if was_asked else logging.WARNING, line)
+        log(logging.INFO if was_asked else logging.WARNING, line)
 
     if robot.waits:  # Its time waits for the stages, so that nothing is dropped.
-        graph, clock = Graph(on_thread=partial(start_thread, {}, report)), fixed_offset(robot.clock_ns)
+        graph, clock = Graph(on_thread=partial(start_thread, {}, log)), fixed_offset(robot.clock_ns)
     else:
         priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
-        graph = Graph(drops=True, depth=1, on_thread=partial(start_thread, priorities, report))
+        graph = Graph(drops=True, depth=1, on_thread=partial(start_thread, priorities, log))
         clock = RobotClock(robot.clock_ns, report=warn)
     with ExitStack() as outputs:
         session = Session(config, graph, outputs, warn, clock)
@@ -140,7 +140,7 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         outputs.enter_context(graph.signals())
         # 2. The connections, and the stages between them.
         health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
-        run_places = _connect(session, FrontEnd(geometry, config, health), robot, report)
+        run_places = _connect(session, FrontEnd(geometry, config, health), robot)
         if geometry.rig.height_m(config.obstacles.scan.floor_m) is None:
             warn(FLOOR_WARNING)
         # 3. The status line of systemd and of a terminal.
@@ -152,14 +152,14 @@ def run_live(config: Config, robot: LiveRobot, report: Report, rig: Rig | None =
         if sys.stderr.isatty():
             wheels = "`omnid arm` lets it drive; " if config.motor.port and config.controller.arming == MANUAL else ""
             endpoints = ", ".join(config.bus.connect if config.bus.is_client else config.bus.listen)
-            report(logging.INFO, f"ready: poses at {endpoints} (`omnid listen`); {wheels}Ctrl-C ends")
+            log(logging.INFO, f"ready: poses at {endpoints} (`omnid listen`); {wheels}Ctrl-C ends")
         if not robot.waits:
             prepare()
         run_to_end(graph, run_places)
     return clock
 
 
-def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Report) -> RunPlaces:
+def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlaces:
     """Connect robot, bus and files, and wire the stages between them; return the map of places."""
     config, graph, clock, statistics = session.config, session.graph, session.clock, session.statistics
     rig, health, motion = front_end.geometry.rig, front_end.health, front_end.pairing.motion
@@ -184,7 +184,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot, report: Re
         bus=BusSink(bus, session.encoder(rig), clock=VelocityCommand if robot.waits else None),
     )
     if config.record.enabled:
-        recorder = open_recorder(config, rig_toml(rig), report, clock, session.encoder(rig, clock.segment_unix_ns))
+        recorder = open_recorder(config, rig_toml(rig), clock, session.encoder(rig, clock.segment_unix_ns))
         session.outputs.callback(recorder.close)
         session.parts[names.RECORDING] = recorder.stats
         outputs = replace(outputs, recorder=recorder)
@@ -273,35 +273,33 @@ def _answer_arming(bus: Bus, state: ControllerState) -> None:
     bus.answer(answer.id, Answer(not answer.refusal, text))
 
 
-def open_recorder(
-    config: Config, rig: str, report: Report, clock: RobotClock, encode: Encoder | None = None
-) -> Recorder:
+def open_recorder(config: Config, rig: str, clock: RobotClock, encode: Encoder | None = None) -> Recorder:
     """Return a recorder to the folder of the configuration; the first message makes the first file.
 
     rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
-    report: takes severity and text of problems. clock: see Recorder. encode: of the other messages of a run, whose
-    images are thinned to record.images_hz; None: all images and nothing else are recorded.
+    clock: see Recorder. encode: of the other messages of a run, whose images are thinned to record.images_hz; None: all
+    images and nothing else are recorded.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = Path(config.record.folder)
-    files = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
+    files = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=log)
     images_hz = config.record.images_hz if encode is not None else 0.0
     return Recorder(files, config.bus.robot, encode, clock=clock, images_hz=images_hz)
 
 
-def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: Report) -> Recorder:
+def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: str) -> Recorder:
     """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
-    clock = RobotClock(report=lambda line: report(logging.WARNING, line))
+    clock = RobotClock(report=partial(log, logging.WARNING))
     graph = Graph(drops=True, depth=RECORDED_DEPTH)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
-    recorder = open_recorder(config, rig, report, clock)
+    recorder = open_recorder(config, rig, clock)
     graph.sink("record", recorder, *frames)
 
     with closing(recorder), graph.signals():
         graph.run()
     state, dropped = recorder.state, graph.telemetry.of("record").dropped
     written = state.messages - state.lost
-    report(
+    log(
         logging.INFO if written else logging.WARNING,
         f"recorded {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
         f"oldest files deleted {state.deleted}, {state.status}",

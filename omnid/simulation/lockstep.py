@@ -124,7 +124,7 @@ def simulate(
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does. vehicle: makes the robot; `Vehicle`, or one with faults.
     """
-    prepare_kernels(no_op)
+    prepare_kernels()
     # 1. The robot, and the lists of what it does.
     config, rig = config or Config(), robot.rig
     run, truth = SimulatedRun(rig.T_base_rig), dict[int, Array]()  # T_world_base by the stamp of a pair [ns]

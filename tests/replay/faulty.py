@@ -23,6 +23,7 @@ from calib.rig_file import read_rig
 from drivers.cameras.log_camera import LogCamera, LogPlayback
 from drivers.frame import Camera, Frame, gray
 from omnid.config import load_config
+from omnid.engine.logging_setup import configure_logging
 from omnid.runs.live import ConnectedRobot, run_live
 
 TIME, TIME_NS = time.time, time.time_ns
@@ -87,10 +88,10 @@ def main() -> int:
     threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
     playback = LogPlayback(args.log)
     config = load_config(None, ["controller.motion.check=false", *args.settings, f"motor.port={args.motor}"])
+    configure_logging()
     run_live(
         config,
         ConnectedRobot(lambda camera: FaultyCamera(playback, camera, faults)),
-        lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True),
         read_rig(args.rig),
     )
     return 0

@@ -102,7 +102,7 @@ class Camera(LogCamera):
             yield frame
 
 cameras = {name: Camera(playback, name) for name in ("lower", "upper")}
-record_frames(cameras, config, rig.read_text(), lambda *_: None)
+record_frames(cameras, config, rig.read_text())
 """
 
 

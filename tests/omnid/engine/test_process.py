@@ -158,9 +158,10 @@ def parts(values, out):
         out[n] = part(values[n])
 """
 PROGRAM = """
-import logging
+import logging, sys
 from omnid.engine.kernel_cache import prepare_kernels
-prepare_kernels(lambda level, line: print(logging.getLevelName(level), line, flush=True))
+logging.basicConfig(stream=sys.stdout, level=logging.INFO, format="%(levelname)s %(message)s")
+prepare_kernels()
 import numpy as np
 from omnid.core.caller_kernels import parts
 out = np.zeros(2)

@@ -65,7 +65,7 @@ def recorded(folder: Path) -> list[Path]:
 
 @pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
 def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, encoding: str) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, clock=set_clock())
+    recorder = open_recorder(settings(tmp_path / "log"), "", clock=set_clock())
     given = [frame(n, camera, encoding) for n in range(3) for camera in ("lower", "upper")]
     for each in given:
         recorder.process(each)
@@ -83,7 +83,7 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
 def test_a_recording_of_fewer_images_holds_whole_pairs(tmp_path: Path, skew_ns: int) -> None:
     """Of three seconds at 30 Hz 15 pairs at 5 Hz; the images of each are as far apart as the cameras are."""
     config = settings(tmp_path, images_hz=5.0)
-    recorder = open_recorder(config, "", lambda *_: None, clock=set_clock(), encode=Encoder(np.eye(4), 0))
+    recorder = open_recorder(config, "", clock=set_clock(), encode=Encoder(np.eye(4), 0))
     for n in range(92):
         lower, upper = frame(n, "lower"), frame(n, "upper")
         upper = replace(upper, stamp_ns=upper.stamp_ns + skew_ns)
@@ -104,7 +104,7 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
     of_run = set_clock()
     encode = Encoder(np.eye(4), 100, of_run.segment_unix_ns)
-    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, clock=of_run)
+    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", encode=encode, clock=of_run)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
@@ -151,7 +151,7 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
         RecordConfig, "rotation", lambda _: RotationSettings(file_bytes=10**6, keep_bytes=10**6 + 65_000, free_bytes=0)
     )
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, encode=encode, clock=of_run)
+    recorder = open_recorder(config, "", encode=encode, clock=of_run)
     for n in range(30):
         stamp_ns = 5 * 10**9 + n * 10**8
         for camera in ("lower", "upper"):
@@ -189,7 +189,7 @@ def attached(path: Path) -> list[str]:
 def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(10**9, 10**10, 0, file_s=1.0))
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, clock=set_clock(), encode=Encoder(np.eye(4), 0))
+    recorder = open_recorder(config, "", clock=set_clock(), encode=Encoder(np.eye(4), 0))
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
     recorder.close()
@@ -202,14 +202,14 @@ def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: p
 
 def test_the_recorder_reports_its_state(tmp_path: Path) -> None:
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, clock=set_clock())
+    recorder = open_recorder(config, "", clock=set_clock())
     assert (entry(RECORDING, recorder.stats()).level, entry(RECORDING, recorder.stats()).message) == (OK, "recording")
     recorder.process(frame(0, "lower"))
     status = entry(RECORDING, recorder.stats())
     assert status.message == "recording" and status.values["messages"] == status.values["files"] == "1"
     recorder.close()
     full = replace(config, record=replace(config.record, free_mb=1_000_000))
-    recorder = open_recorder(full, "", lambda *_: None, clock=set_clock())
+    recorder = open_recorder(full, "", clock=set_clock())
     recorder.process(frame(0, "lower"))
     status = entry(RECORDING, recorder.stats())
     assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
