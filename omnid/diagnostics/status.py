@@ -22,7 +22,7 @@ from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILE
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES, Side
-from omnid.engine.graph import Histogram, Telemetry
+from omnid.engine.graph import Histogram, StageStats
 from omnid.engine.logging_setup import HANDLER
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import OdometryUpdate
@@ -190,7 +190,7 @@ class StatusCollector:
 
     def __init__(
         self,
-        telemetry: Telemetry,
+        stages: Mapping[str, StageStats],
         cameras: Mapping[Camera, CameraState],
         pair: Synchronise,
         statistics: RunStatistics,
@@ -198,7 +198,7 @@ class StatusCollector:
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """parts: numbers of the other parts, by their names. clock_ns: the clock of the stamps of images and poses."""
-        self._telemetry, self._cameras, self._pair, self._statistics = telemetry, cameras, pair, statistics
+        self._stages, self._cameras, self._pair, self._statistics = stages, cameras, pair, statistics
         self._parts, self._clock_ns = parts, clock_ns
         self._before: dict[str, int] = {}  # counts of the last report
         self._before_s, self._span_s = time.monotonic(), math.nan
@@ -210,9 +210,9 @@ class StatusCollector:
         found: dict[str, Stats] = {status_names.ODOMETRY: self._odometry(), status_names.PAIRING: self._pairing()}
         found |= {f"{status_names.PREFIX}{name} camera": self._camera(name) for name in self._cameras}
         found |= {name: stats() for name, stats in self._parts.items()}
-        for stage in self._telemetry.stages:
-            found[status_names.stage_name(stage.name)] = {
-                Key.RATE_HZ: self._rate_hz(stage.name, stage.processed),
+        for name, stage in self._stages.items():
+            found[status_names.stage_name(name)] = {
+                Key.RATE_HZ: self._rate_hz(name, stage.processed),
                 Key.PROCESSED: stage.processed,
                 Key.DROPPED: stage.dropped,
                 **times(status_names.WORK, stage.wall),  # for a message
@@ -250,7 +250,7 @@ class StatusCollector:
         }
 
     def _pairing(self) -> Stats:
-        pair, images = self._pair, self._telemetry.of("pair")
+        pair, images = self._pair, self._stages["pair"]
         stats: dict[str, Any] = pair.stats()
         missing = [name for name, stamp_ns in pair.newest_ns.items() if not self._age_s(stamp_ns) <= TIMEOUT_S]
         pairs_hz, broken_hz = (self._rate_hz(name, pair.counts[name]) for name in ("pairs", "broken"))

@@ -107,7 +107,6 @@ class StageStats:
     processed; 0 when idle.
     """
 
-    name: str
     processed: int = 0
     dropped: int = 0
     busy_since_ns: int = 0
@@ -123,27 +122,6 @@ class StageStats:
         self.wall.add((time.monotonic_ns() - start_ns) * S_PER_NS)
         self.processed += 1
         return result
-
-
-class Telemetry:
-    """Registry of all counters of a run, in the order of the wiring."""
-
-    def __init__(self) -> None:
-        self.stages: list[StageStats] = []
-
-    def add(self, stats: StageStats) -> StageStats:
-        """Register the counters, whose name is that of no other stage, and return them."""
-        assert stats.name not in [other.name for other in self.stages], stats.name
-        self.stages.append(stats)
-        return stats
-
-    def of(self, name: str) -> StageStats:
-        """Return the counters of a stage; StopIteration without it."""
-        return next(stats for stats in self.stages if stats.name == name)
-
-    def summary(self) -> dict[str, dict[str, float]]:
-        """Return n (messages), drops, p50_ms, p99_ms and max_ms (time of one, NaN without any) by stage."""
-        return {s.name: {"n": s.processed, "drops": s.dropped, **s.wall.times_ms()} for s in self.stages}
 
 
 class Stage(Protocol[In_contra, Out_co]):
@@ -180,14 +158,15 @@ class Stream(Generic[T_co]):
 class _Node:
     """A stage or a sink with its counters and its output; after an error it drops its messages, and counts them."""
 
-    def __init__(self, graph: Graph, stats: StageStats, work: Any, writers: int, thread: str) -> None:
+    def __init__(self, graph: Graph, name: str, work: Any, writers: int, thread: str) -> None:
         """writers: number of streams that it reads."""
-        self.stats, self.writers, self._graph, self._work = stats, writers, graph, work
+        self.stats, self.writers, self._graph, self._work = graph.counters(name), writers, graph, work
+        self._name = name
         self.stream: Stream[Any] = Stream(thread)
 
     def put(self, message: object) -> None:
         """Process the message, and pass on its result; at the end of the last input, the remaining results and END."""
-        graph, name = self._graph, self.stats.name
+        graph, name = self._graph, self._name
         has_failed = name in graph.failed
         if message is END:
             self.writers -= 1
@@ -273,7 +252,8 @@ class Graph:
         depth: int = 2,
         on_thread: Callable[[str], object] = no_op,
     ) -> None:
-        self.telemetry, self.drops, self.threaded = Telemetry(), drops, threaded
+        self.stats: dict[str, StageStats] = {}  # by name, in the order of the wiring
+        self.drops, self.threaded = drops, threaded
         self._depth, self._on_thread = depth, on_thread
         self.lock = threading.Lock()  # of all inboxes
         self.idle = threading.Condition(self.lock)
@@ -289,14 +269,20 @@ class Graph:
 
     # The wiring.
 
+    def counters(self, name: str) -> StageStats:
+        """Return new counters, whose name is that of no other stage."""
+        assert name not in self.stats, name
+        return self.stats.setdefault(name, StageStats())
+
     def source(self, name: str, messages: Callable[[], Iterable[T]], *, wake: Callable[[], None] = no_op) -> Stream[T]:
         """Add a source: an iterable that is opened, read and closed in the source's own thread.
 
         `wake` is called once to end a threaded run early: it must end the current read and all later ones. Inline,
         sources are read one after the other.
         """
+        self.counters(name)
         stream: Stream[T] = Stream(name)
-        self._sources[name] = partial(self._run_source, self.telemetry.add(StageStats(name)), messages, stream)
+        self._sources[name] = partial(self._run_source, name, messages, stream)
         self._wakes[name] = wake
         self._open_sources += 1
         return stream
@@ -319,7 +305,7 @@ class Graph:
         without an inbox. depth: of its inbox, if not that of the graph.
         """
         thread = thread or name
-        node = _Node(self, self.telemetry.add(StageStats(name)), stage, len(inputs), thread)
+        node = _Node(self, name, stage, len(inputs), thread)
         for stream in inputs:
             if not self.threaded or stream.thread == thread:
                 stream.readers.append(node.put)
@@ -401,10 +387,10 @@ class Graph:
         self._on_thread(name)
         body()
 
-    def _run_source(self, stats: StageStats, begin: Callable[[], Iterable[object]], stream: Stream[Any]) -> None:
+    def _run_source(self, name: str, begin: Callable[[], Iterable[object]], stream: Stream[Any]) -> None:
         """Pass on the messages of a source; then end its stream, and after the last source the inlets."""
-        messages = iter(tuple[object]())
-        with self.catch_failure(stats.name):
+        stats, messages = self.stats[name], iter(tuple[object]())
+        with self.catch_failure(name):
             try:
                 messages, start_ns = iter(() if self.is_stopping else begin()), time.monotonic_ns()
                 for message in messages:

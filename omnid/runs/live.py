@@ -34,7 +34,7 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import RunStatistics, StatusCollector, image_stats, rig_stats, wheel_stats
-from omnid.engine.graph import Graph, Stream, Telemetry
+from omnid.engine.graph import Graph, StageStats, Stream
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER, log
 from omnid.engine.process import prepare, start_thread
@@ -146,7 +146,7 @@ def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> RobotC
         # 3. The status line of systemd and of a terminal.
         outputs.callback(HANDLER.show, "")
         outputs.callback(notify, "STOPPING=1", "STATUS=stopping")
-        service = Service(graph.telemetry, session.statistics, config.service.stall_timeout_s)
+        service = Service(graph.stats, session.statistics, config.service.stall_timeout_s)
         session.every(period_s(), service, "watchdog")
         # 4. The run, until a signal or a failure ends it.
         if sys.stderr.isatty():
@@ -254,7 +254,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     if run_places.saves:
         session.parts[names.MAP_FILE] = run_places.stats
     collect = StatusCollector(
-        graph.telemetry, robot.states, front_end.pairing, statistics, session.parts, clock.monotonic_ns
+        graph.stats, robot.states, front_end.pairing, statistics, session.parts, clock.monotonic_ns
     )
     session.every(
         config.live.status_s,
@@ -297,7 +297,7 @@ def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: st
 
     with closing(recorder), graph.signals():
         graph.run()
-    state, dropped = recorder.state, graph.telemetry.of("record").dropped
+    state, dropped = recorder.state, graph.stats["record"].dropped
     written = state.messages - state.lost
     log(
         logging.INFO if written else logging.WARNING,
@@ -328,16 +328,16 @@ class Service:
     A daemon that waits for images has no message in work.
     """
 
-    def __init__(self, telemetry: Telemetry, statistics: RunStatistics, stall_timeout_s: float) -> None:
-        """stall_timeout_s: longest time that a stage may work on one message."""
-        self._telemetry, self._statistics = telemetry, statistics
+    def __init__(self, stages: Mapping[str, StageStats], statistics: RunStatistics, stall_timeout_s: float) -> None:
+        """stages: counters of all. stall_timeout_s: longest time that a stage may work on one message."""
+        self._stages, self._statistics = stages, statistics
         self._stall_ns, self._was_stalled, self._poses = stall_timeout_s / S_PER_NS, False, 0
 
     def __call__(self) -> None:
         """Notify systemd."""
         # 1. Stages that work on one message for too long.
         now_ns, found = time.monotonic_ns(), self._statistics
-        busy = [(stage.name, stage.busy_since_ns) for stage in self._telemetry.stages]
+        busy = [(name, stage.busy_since_ns) for name, stage in self._stages.items()]
         stalled = [name for name, since_ns in busy if since_ns and now_ns - since_ns > self._stall_ns]
         if stalled and not self._was_stalled:
             log(logging.ERROR, f"stalled: {', '.join(stalled)}; the watchdog of systemd is no longer fed")
@@ -345,7 +345,7 @@ class Service:
         # 2. State, and what was lost.
         has_new, self._poses = found.poses > self._poses, found.poses
         state = found.newest.state if found.newest is not None and has_new else "waiting for images"
-        dropped = sum(stage.dropped for stage in self._telemetry.stages)
+        dropped = sum(stage.dropped for stage in self._stages.values())
         line = f"{found.length_m:.2f} m, {state}, {dropped} messages dropped"
         line = f"stalled: {', '.join(stalled)}" if stalled else line
         HANDLER.show(line)

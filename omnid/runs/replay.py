@@ -262,7 +262,10 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             np.array([pose.covariance for pose in poses], np.float64).reshape(-1, 6, 6),
             tuple(pose.state for pose in poses),
             counters,
-            graph.telemetry.summary(),
+            {
+                name: {"n": one.processed, "drops": one.dropped, **one.wall.times_ms()}
+                for name, one in graph.stats.items()
+            },
             (*dict.fromkeys(warnings), *_run_warnings(session, reader, front_end, stages, counters)),
             newest_map[0].points if newest_map else None,
             graph.signal,

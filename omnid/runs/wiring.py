@@ -23,7 +23,7 @@ from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.diagnostics.status import RunStatistics
-from omnid.engine.graph import Graph, Output, Poller, StageStats, Stream, run_in_thread
+from omnid.engine.graph import Graph, Output, Poller, Stream, run_in_thread
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
@@ -135,7 +135,7 @@ class Session:
         elif not self.config.obstacles.enabled:
             settings = settings.without_obstacles
         start = ControllerStart(self.config.motor, settings, realtime, waits=of_replay)
-        link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
+        link = ControllerLink(start, self.graph.counters("motor"), self.warn)
         self.outputs.callback(link.close)
         return link
 

@@ -52,7 +52,7 @@ class PacedRobot:
             lambda _, line: self._report(line),
             self._start_ns,
         )
-        self._ticks = StageStats("motor")
+        self._ticks = StageStats()
         self.statistics = ControllerStatistics(self._ticks)
         self._commands: SimpleQueue[VelocityCommand | None] = SimpleQueue()  # None: the end
         self._contact = NO_CONTACT
@@ -69,7 +69,7 @@ class PacedRobot:
     def connect(self, session: Session, motion: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink]:
         """Return one source of both cameras, which advances the time, and the link to the controller."""
         graph, self._report = session.graph, session.warn
-        graph.telemetry.add(self._ticks)
+        graph.stats["motor"] = self._ticks
         session.parts[SIMULATION] = self.stats
         return [graph.source("cameras", lambda: self._frames(graph.settle, motion), wake=self.close)], self
 

@@ -79,7 +79,7 @@ class Bench:
             clock_ns=lambda: self.now_ns,
             limited=drive.limited if drive else None,
         )
-        self.statistics = ControllerStatistics(StageStats("motor"))
+        self.statistics = ControllerStatistics(StageStats())
 
     @property
     def last(self) -> VelocityCommand:

@@ -108,7 +108,7 @@ class Robot:
         self.commands: list[VelocityCommand] = []
         self.lines: list[str] = []
         self.error: OmnidError | None = None
-        self.stats = StageStats("motor")
+        self.stats = StageStats()
         start = start_message(base.port, arming, has_scans=has_scans)
         self.link = ControllerLink(start, self.stats, self.lines.append)
         self._thread = threading.Thread(target=self._read)
@@ -265,7 +265,7 @@ def arm(robot: Robot) -> None:
 OWNER = """
 import sys, time
 from tests.omnid.controller.test_link import AHEAD, ControllerLink, StageStats, TimedSetpoint, pose, start_message
-link = ControllerLink(start_message(sys.argv[1]), StageStats("motor"), print)
+link = ControllerLink(start_message(sys.argv[1]), StageStats(), print)
 while True:
     link.send(pose())
     link.send(TimedSetpoint(time.monotonic_ns(), AHEAD))
@@ -299,7 +299,7 @@ def _has_open(base: Base) -> bool:
 
 def test_raises_the_drivers_error_where_the_port_does_not_exist_and_is_not_waited_for() -> None:
     with pytest.raises(DriverError, match=r"motor port '/dev/nothing'.*there is no such port"):
-        ControllerLink(start_message("/dev/nothing")._replace(waits=True), StageStats("motor"), print)
+        ControllerLink(start_message("/dev/nothing")._replace(waits=True), StageStats(), print)
 
 
 @pytest.mark.hazard("H04")
@@ -307,7 +307,7 @@ def test_a_motor_controller_that_comes_late_or_again_drives_only_after_it_was_ar
     port, lines = tmp_path / "motor", list[str]()
     start = start_message(port, MANUAL)
     motor = replace(start.motor, boot_s=1.0, watchdog_ms=500)
-    with contextlib.closing(ControllerLink(start._replace(motor=motor), StageStats("motor"), lines.append)) as link:
+    with contextlib.closing(ControllerLink(start._replace(motor=motor), StageStats(), lines.append)) as link:
 
         def state(*, arm: bool = True) -> ControllerState:
             link.receive_waiting()

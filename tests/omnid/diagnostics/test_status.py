@@ -23,7 +23,7 @@ from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.status import RunStatistics, StatusCollector, image_stats, wheel_stats
-from omnid.engine.graph import StageStats, Telemetry
+from omnid.engine.graph import StageStats
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.sinks.drive import controller_pose
@@ -58,16 +58,16 @@ class Daemon:
     """The parts of a daemon whose status is collected."""
 
     def __init__(self, rig: Rig) -> None:
-        self.telemetry, self.statistics = Telemetry(), RunStatistics(RobotClock())
-        self.stages = [self.telemetry.add(StageStats(name)) for name in ("pair", "motor")]
+        self.statistics = RunStatistics(RobotClock())
+        self.stages = {name: StageStats() for name in ("pair", "motor")}
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = Synchronise(rig, PairConfig())
         self.motor = AcceptingMotor()
         self.controller = Controller(self.motor, ControllerSettings().without_obstacles, 0.05)
-        self.controller_statistics = ControllerStatistics(self.stages[1])
+        self.controller_statistics = ControllerStatistics(self.stages["motor"])
         self.commands = CommandReceiver(Freshness(0.5), controller=self)
         self.report = StatusCollector(
-            self.telemetry,
+            self.stages,
             self.cameras,
             self.pair,
             self.statistics,
@@ -150,8 +150,8 @@ def test_a_computer_that_is_too_slow_is_named_with_what_to_do(daemon: Daemon) ->
     daemon.collected()
     for dropped in (5, 20):
         daemon.shoot("lower", "upper")
-        daemon.stages[0].processed += 100
-        daemon.stages[0].dropped += dropped
+        daemon.stages["pair"].processed += 100
+        daemon.stages["pair"].dropped += dropped
         status = daemon.collected()["pairing"]
         assert ("too slow" in status.message and status.level == WARN) == (dropped > 10)
 

@@ -154,7 +154,7 @@ def test_a_stop_by_a_signal_drains_and_finishes(threaded: bool) -> None:
     graph.sink("sink", sink, graph.stage("pass", stop_at_5, graph.source("numbers", count)))
     with graph.signals():
         graph.run()
-    assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all messages of the source
+    assert sink.got == list(range(graph.stats["numbers"].processed))  # all messages of the source
     assert len(sink.got) >= 6 and sink.finished == 1
 
 
@@ -201,7 +201,7 @@ def test_a_replay_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
     graph.run()
     assert slow.got == list(range(300))
     assert max(ahead) <= 3 + 2  # the inbox, one message at the writer, one at the reader
-    assert [row["drops"] for row in graph.telemetry.summary().values()] == [0, 0, 0]
+    assert [one.dropped for one in graph.stats.values()] == [0, 0, 0]
 
 
 def test_a_live_inbox_drops_the_oldest_message_and_counts_it() -> None:
@@ -222,7 +222,7 @@ def test_a_live_inbox_drops_the_oldest_message_and_counts_it() -> None:
     assert fast.got == list(range(50))  # the depth of the sink
     assert slow.got[-2:] == [48, 49]
     assert len(slow.got) in (2, 3)  # and perhaps the first one
-    counted = {stats.name: (stats.processed, stats.dropped) for stats in graph.telemetry.stages}
+    counted = {name: (stats.processed, stats.dropped) for name, stats in graph.stats.items()}
     assert counted["hold"] == (len(slow.got), 50 - len(slow.got))
     assert counted["numbers"] == counted["fast"] == (50, 0)
 
@@ -244,7 +244,7 @@ def test_stages_of_one_thread_share_it_and_pass_messages_directly() -> None:
     graph.stage("other", noted("other"), numbers, thread="shared")
     graph.sink("beside", beside, first, depth=100)
     graph.run()
-    of_first = graph.telemetry.of("first")
+    of_first = graph.stats["first"]
     assert of_first.processed + of_first.dropped == 100 and last.got[-1] == 99
     assert last.got == beside.got and last.finished == beside.finished == 1, "nothing is dropped between the two"
     assert {thread for _, thread in seen} == {"shared"} and seen["first", "shared"] == seen["second", "shared"]

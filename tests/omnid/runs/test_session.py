@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from omnid.diagnostics.status import RunStatistics
-from omnid.engine.graph import StageStats, Telemetry
+from omnid.engine.graph import StageStats
 from omnid.runs.live import Service, period_s
 
 
@@ -39,9 +39,8 @@ def test_a_stalled_stage_stops_the_watchdog_and_is_logged_once(
     received: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "omnid")
-    telemetry = Telemetry()
-    stage, _ = telemetry.add(StageStats("valve")), telemetry.add(StageStats("idle"))
-    service = Service(telemetry, RunStatistics(), 0.5)
+    stage = StageStats()
+    service = Service({"valve": stage, "idle": StageStats()}, RunStatistics(), 0.5)
     stage.busy_since_ns = time.monotonic_ns()
     service()
     line = "0.00 m, waiting for images, 0 messages dropped"

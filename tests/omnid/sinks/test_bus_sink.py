@@ -175,7 +175,7 @@ class Link:
     def __init__(self) -> None:
         self.poses: list[ControllerPose] = []
         self.setpoints: list[tuple[Setpoint, int]] = []
-        self.statistics = ControllerStatistics(StageStats("motor"))
+        self.statistics = ControllerStatistics(StageStats())
         self.ended = False
 
     def send(self, given: ControllerPose | TimedSetpoint) -> None:

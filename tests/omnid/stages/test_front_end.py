@@ -138,7 +138,7 @@ def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: l
         outputs,
     )
     graph.run()
-    assert statistics.poses == graph.telemetry.of("odometry").processed
+    assert statistics.poses == graph.stats["odometry"].processed
 
 
 def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: list[Frame]) -> None:
@@ -152,7 +152,7 @@ def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: li
     inputs = Inputs(list(cameras.values()), RunPlaces(CONFIG, place, no_op))
     wire(CONFIG, inputs, stages, graph, Outputs(counters={"statistics": statistics}))
     graph.run()
-    of = graph.telemetry.of
+    of = graph.stats.__getitem__
     assert of("pair").dropped > 0 and of("odometry").dropped == 0
     assert 0 < statistics.poses == of("dewarp").processed == of("odometry").processed == of("keyframes").processed
     assert of("pair").dropped + of("pair").processed == 2 * PAIRS
