@@ -43,7 +43,6 @@ class RunStatistics:
         self.poses = 0
         self.length_m = 0.0
         self.states: Counter[str] = Counter()
-        self.resets = 0
         self.dark_pairs = 0
         self.lost_parts: Counter[Side] = Counter()  # pairs in which a part of a camera's image was frozen or blind
         self.newest: OdometryUpdate | None = None
@@ -63,7 +62,6 @@ class RunStatistics:
         self.dark_pairs += odometry.light.is_too_dark
         columns = odometry.depth.panoramas.tiles.columns
         self.lost_parts.update(side for side, found in columns.items() if found.any())
-        self.resets = odometry.reset_counter
         self.poses += 1
 
 

@@ -24,7 +24,6 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.logs.mcap_writer import RotatingLog
-from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.ipc import ARMED, ControllerState
 from omnid.controller.link import DriveLink
@@ -180,8 +179,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
         pairs={"exposure": exposure},
         counters={"statistics": statistics},
         answers=answer,
-        # The ticks of a simulated controller give the time.
-        bus=BusSink(bus, session.encoder(rig), clock=VelocityCommand if robot.waits else None),
+        bus=BusSink(bus, session.encoder(rig), gives_time=robot.waits),
     )
     if config.record.enabled:
         recorder = open_recorder(config, rig_toml(rig), clock, session.encoder(rig, clock.segment_unix_ns))
@@ -210,7 +208,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         navigation = graph.inlet(topics.MOST_OPEN), states
     inputs = Inputs(frames, run_places, controller, navigation, reports, config.live.cloud_s)
-    stages = wire(config, inputs, front_end, graph, outputs)
+    places = wire(config, inputs, front_end, graph, outputs)
 
     # 4. Commands and requests from the bus; without a motor all but those to save the map are refused.
     def add_sample(topic: str, payload: bytes) -> None:
@@ -249,8 +247,8 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     }
     if controller is not None:
         session.parts[names.WHEELS] = partial(wheel_stats, controller.statistics, commands)
-    if stages.places is not None:
-        session.parts[names.PLACES] = stages.places.stats
+    if places is not None:
+        session.parts[names.PLACES] = places.stats
     if run_places.saves:
         session.parts[names.MAP_FILE] = run_places.stats
     collect = StatusCollector(

@@ -31,16 +31,17 @@ from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
+from omnid.messages import MapUpdate, PlaceUpdate
 from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.files import RunPlaces
-from omnid.runs.wiring import Inputs, Outputs, Session, WiredStages, attached_rig, run_to_end, wire
+from omnid.runs.wiring import Inputs, Outputs, Session, attached_rig, run_to_end, wire
 from omnid.settings import dump
 from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import BusSink, Outgoing
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
+from omnid.stages.mapping import Places
 from omnid.stages.obstacles import FLOOR_WARNING
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.status_names import MOTION, entry
@@ -214,12 +215,12 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             wheels = ReplayDrive(controller, config.controller.setpoint.setpoint(), rig.T_base_rig, front_end.health)
             outputs.counters["controller"] = wheels
         if options.publish:
-            bus = BusSink(session.open_bus(rig, gives_time=True), session.encoder(rig), clock=OdometryUpdate)
+            bus = BusSink(session.open_bus(rig, gives_time=True), session.encoder(rig), gives_time=True)
         outputs = replace(outputs, bus=bus, recorder=options.observer(front_end) if options.observer else recorder)
         paced = partial(_paced, reader, graph)
         messages = graph.source("read", paced if options.paced else reader.messages)
         inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
-        stages = wire(config, inputs, front_end, graph, outputs)
+        places = wire(config, inputs, front_end, graph, outputs)
         if options.progress is not None:
             show = partial(options.progress, session.statistics, reader.pair_estimate())
             closing.callback(show, True)
@@ -239,9 +240,9 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             found.poses,
             found.length_m,
             {state: found.states[state] for state in TrackingState},
-            found.resets,
+            found.newest.reset_counter if found.newest else 0,
             drops,
-            {} if stages.places is None else stages.places.counts,
+            {} if places is None else places.counts,
             {} if wheels is None else wheels.counts(),
             pair_loss(front_end.pairing, read),
         )
@@ -249,7 +250,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             recorder.close()
 
         # 5. Poses in the map: corrected by its later loops, and as they were known while driving.
-        places = stages.places
         corrected = [] if places is None else [places.corrected(each) for each in updates]
         in_map = np.array(corrected, float).reshape(-1, 4, 4)
         live = np.array([each.T_map_rig for each in updates], float).reshape(-1, 4, 4)
@@ -266,7 +266,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
                 name: {"n": one.processed, "drops": one.dropped, **one.wall.times_ms()}
                 for name, one in graph.stats.items()
             },
-            (*dict.fromkeys(warnings), *_run_warnings(session, reader, front_end, stages, counters)),
+            (*dict.fromkeys(warnings), *_run_warnings(session, reader, front_end, places, counters)),
             newest_map[0].points if newest_map else None,
             graph.signal,
             in_map,
@@ -289,7 +289,7 @@ def _paced(reader: LogReader, graph: Graph) -> Iterator[Frame | MotionSample]:
 
 
 def _run_warnings(
-    session: Session, reader: LogReader, front_end: FrontEnd, stages: WiredStages, counters: RunCounters
+    session: Session, reader: LogReader, front_end: FrontEnd, places: Places | None, counters: RunCounters
 ) -> Iterator[str]:
     """Yield warnings about the log and the images."""
     yield from reader.warnings
@@ -304,7 +304,7 @@ def _run_warnings(
     if message and not (fault.reason and message.startswith(fault.reason)):
         yield f"wheels and gyro: {message}"
     config, rig = session.config, front_end.geometry.rig
-    if (stages.places or stages.obstacles) and rig.height_m(config.obstacles.scan.floor_m) is None:
+    if places and rig.height_m(config.obstacles.scan.floor_m) is None:
         yield FLOOR_WARNING
     yield from front_end.image_faults
     yield from input_warnings(front_end.pairing, front_end.health, session.statistics, config)

@@ -7,7 +7,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 
@@ -174,15 +174,8 @@ class Outputs:
     recorder: Output[Any] | None = None  # takes them as well
 
 
-class WiredStages(NamedTuple):
-    """The stages that are asked for counts and warnings."""
-
-    places: Places | None
-    obstacles: Obstacles | None
-
-
-def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outputs: Outputs) -> WiredStages:
-    """Join the stages to the inputs and to the outputs; return those that are asked for counts.
+def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outputs: Outputs) -> Places | None:
+    """Join the stages to the inputs and to the outputs; return the places, if they are wired.
 
     Where inboxes drop, one thread makes a pose of the newest images, so that old images are dropped before any work.
     Else decoding and dewarping are one bounded inbox ahead of the odometry. Places, obstacles and navigation have a
@@ -277,7 +270,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
     graph.sink("keyframes", lambda _: front_end.complete(), poses, thread=poses.thread)
-    return WiredStages(places, obstacles)
+    return places
 
 
 def wheel_state(state: ControllerState) -> WheelState:

@@ -185,16 +185,17 @@ def navigation_stats(update: NavigationUpdate) -> Stats:
 class BusSink:
     """Publishes encoded messages; live, its inbox drops the oldest, because the bus may be slow."""
 
-    def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
-        """clock: type of the messages, of one thread, whose stamps advance /clock; None: there is no /clock."""
-        self._clock, self._time_ns = clock, 0
+    def __init__(self, bus: Bus, encode: Encoder, *, gives_time: bool = False) -> None:
+        """gives_time: /clock advances by the stamps of poses and commands, which come from one thread."""
+        self._gives_time, self._time_ns = gives_time, 0
         self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
         self._bus, self._encode, encode.run_id = bus, encode, RUN_ID
 
     def process(self, message: Outgoing) -> None:
         """Publish a message; a pose with its attachment."""
         # 1. The clock, before what is stamped by it.
-        if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
+        is_moment = self._gives_time and isinstance(message, OdometryUpdate | VelocityCommand)
+        if is_moment and message.stamp_ns > self._time_ns:
             self._time_ns = message.stamp_ns
             self._bus.publish(CLOCK, encoded(CLOCK_SCHEMA, self._encode.unix_ns(message.stamp_ns)))
         # 2. The message itself.

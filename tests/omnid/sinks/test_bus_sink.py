@@ -77,7 +77,7 @@ def test_a_run_with_a_time_of_its_own_publishes_it_and_never_back(gives_time: bo
     came: list[tuple[str, bytes]] = []
     bus = Bus(BusConfig(listen=(endpoint,)), gives_time=gives_time)
     with contextlib.closing(bus), Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), 10, unix_ns), clock=OdometryUpdate if gives_time else None)
+        sink = BusSink(bus, Encoder(np.eye(4), 10, unix_ns), gives_time=gives_time)
         robot.on_message(lambda topic, payload, _: came.append((topic, payload)))
         wait_until(lambda: sink.process(odometry(len(came) + 2)) is None and any(topic == "odom" for topic, _ in came))
         newest = len(came) + 100
