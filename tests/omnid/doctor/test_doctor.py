@@ -128,7 +128,7 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
-    subjects = "camera lower,camera upper,rig,motor,real time,memory,disk,bus"
+    subjects = "camera lower,camera upper,rig,motor,real time,disk,bus"
     assert set(subjects.split(",")) <= {line[9:22].strip() for line in lines} and " errors, " in last
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
