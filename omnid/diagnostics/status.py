@@ -20,7 +20,7 @@ from omnid.core.control.arming import STARTED
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.core.rig.rig_health import VIEWS, RigHealth
+from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import SIDES, Side
 from omnid.engine.graph import Histogram, StageStats
 from omnid.engine.logging_setup import HANDLER
@@ -319,12 +319,8 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
 
 
 def rig_stats(health: RigHealth) -> Stats:
-    """Return the state of the rig, and the evidence of the newest finding."""
-    stats = {Key.STATE: health.state, "views": len(health.views), "needed_views": VIEWS}
-    stats["_error" if health.state.is_contradicted else "_warning"] = health.warning
-    if (found := health.finding) is not None:
-        stats |= {name: getattr(found, name) for name in ("turn_deg", "left_px", "matches", "tried")}
-    return stats
+    """Return the state of the rig, and what contradicts it."""
+    return {Key.STATE: health.state, "_error" if health.state.is_contradicted else "_warning": health.warning}
 
 
 def image_stats(newest: OdometryUpdate | None) -> Stats:
