@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import predicted
+from omnid.core.control.collision_monitor import LEAST_MPS
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.path import DrivePath, PathLeg, straight_leg
 from omnid.core.navigation.settings import NavigationSettings
@@ -23,7 +24,6 @@ Array = NDArray[np.float64]
 TURN_RAD, TURNED_RAD = math.radians(45), math.radians(4)
 BRAKE_SHARE: Final = 0.7  # Share of the deceleration that is planned, because the base follows with a lag.
 APPROACH_HZ: Final = 1.2  # speed per distance to the end, so that the last centimetres are slow
-LAST_MPS: Final = 0.02  # Least speed before the end: twice the noise of odometry at standstill.
 SETTLED: Final = 3  # consecutive poses at rest that must be within the tolerance
 SETTLED_RADPS: Final = 0.1
 CORNER_M: Final = 0.03  # A leg ends this far from its end, unless it is the last one.
@@ -114,7 +114,7 @@ class Follower:
         goal_rad, missing = self.path.final_heading_rad, self.path.goal - pose[:2]
         missing_m = float(np.hypot(*missing))
         error_rad = 0.0 if goal_rad is None else wrap_angle(goal_rad - float(pose[2]))
-        is_at_rest = abs(speed_mps) < 2 * LAST_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
+        is_at_rest = abs(speed_mps) < 2 * LEAST_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
         within = abs(error_rad) <= math.radians(self.settings.goal_deg)
         self._settled = self._settled + 1 if is_at_rest and within else 0
         if self._settled < SETTLED:
@@ -158,7 +158,7 @@ class Follower:
         sharpest = float(np.abs(leg.curvature[near]).max(initial=abs(curvature)))
         share = min(1.0, 1.0 / max(sharpest * s.slow_radius_m, 1e-9), max(0.0, obstacle_m) / s.slow_obstacle_m)
         braking_mps = math.sqrt(2 * BRAKE_SHARE * s.acceleration_mps2 * max(left_m, 0.0))
-        ending_mps = max(LAST_MPS, min(braking_mps, APPROACH_HZ * left_m)) if left_m > 0 else 0.0
+        ending_mps = max(LEAST_MPS, min(braking_mps, APPROACH_HZ * left_m)) if left_m > 0 else 0.0
         wanted_mps = max(share * highest_mps, min(s.least_mps, highest_mps))
         wanted_mps = min(wanted_mps, s.yaw_rate_radps / max(abs(curvature), 1e-9), ending_mps)
         self._speed_mps = max(0.0, min(wanted_mps, self._speed_mps + s.acceleration_mps2 * dt_s))

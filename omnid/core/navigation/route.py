@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative, wrapped
+from omnid.core.control.collision_monitor import LEAST_MPS as STANDING_MPS
 from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path
 from omnid.errors import OmnidError
 
@@ -24,7 +25,6 @@ SPACING_M, SPACING_RAD = 0.1, math.radians(10)  # Motion between two points of a
 MOST_POINTS: Final = 15_000  # Points of a route, so that it is bounded: 1.5 km.
 SHORTEST_ROUTE_M: Final = 0.5
 LEAST_MPS: Final = 0.1  # Slower parts of the recording are repeated at this speed.
-STANDING_MPS: Final = 0.02
 SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be in the map
 CLOSED_M: Final = 1.0  # Most distance between the ends of a route that is driven in rounds.
 ENTRY_M: Final = 1.5  # Most distance of the robot from a route that it repeats.

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.control.collision_monitor import CollisionSettings, Outline, unknown_ends
-from omnid.core.obstacles.grid import CELL_M, OCCUPIED, UNKNOWN, FloorGrid
+from omnid.core.obstacles.grid import CELL_M, OCCUPIED, SQUARE, UNKNOWN, FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 
 Array = NDArray[np.float64]
@@ -33,7 +33,6 @@ MEETING_S: Final = 0.6  # The base or a moving object may be early or late by th
 LARGEST_SIGMA_M: Final = 0.15  # Most uncertainty of a prediction that is kept free: beyond it nothing would be free.
 OWN_M: Final = 0.25  # Cells belong to a moving object up to this distance beyond its radius.
 TRAIL_S: Final = 0.5  # The grid shows a moving object for this time where it was, because pairs vote.
-SPECK: Final = np.ones((3, 3), np.uint8)  # Smaller patches of unknown floor are ignored.
 ROUNDING_M: Final = 0.1 * CELL_M  # A smaller change of the distance between two points of a way is none.
 
 
@@ -63,9 +62,9 @@ class Surroundings:
         is_own = _from_segments_m(self._places(is_occupied), trail, self._state[:, :2]) <= self._radius_m + OWN_M
         is_occupied[is_occupied] = ~is_own.any(axis=1)
         self.distance_m = distances_m(is_occupied)  # of each cell to the nearest obstacle
-        # 2. Floor that is not known, and floor that was not seen although the base came near.
+        # 2. Floor that is not known, and patches of floor that were not seen although the base came near.
         self.is_unknown = states == UNKNOWN
-        is_patch = cv2.morphologyEx(self.is_unknown.view(np.uint8), cv2.MORPH_OPEN, SPECK) > 0
+        is_patch = cv2.morphologyEx(self.is_unknown.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
         is_unseen = np.zeros(states.shape, bool)
         if pose is not None:
             middle = grid.corner_m + 0.5 * CELL_M - pose[:2]

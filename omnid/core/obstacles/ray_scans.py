@@ -40,7 +40,7 @@ from omnid.core.obstacles.plane_view import (
     WorkingPair,
     floor_plane,
 )
-from omnid.core.obstacles.posterior import ray_belief
+from omnid.core.obstacles.posterior import MAD, ray_belief
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -52,14 +52,14 @@ FOLLOWED_NS: Final = 500_000_000  # between two pairs by which a known tilt, and
 PRIOR_RAD: Final = math.radians(1.0)  # sigma of a rig that leans,
 DRIFT_RAD: Final = math.radians(0.05)  # of its change from pair to pair,
 SURE_RAD: Final = math.radians(0.3)  # and of a tilt that is used
-LEAST_RAD: Final = math.radians(0.15)  # change of a tilt for which tables are made again,
-LEAST_M: Final = 0.005  # and of a height
+LEAST_M: Final = 0.005  # change of the floor for which tables are made again,
+LEAST_RAD: Final = LEAST_M / LEAN_M  # and of its tilt
 CORRELATED: Final = 20.0  # pixels with one error: neighbours are smoothed, and share what is wrong
 HALF_BASE_M: Final = 0.5  # From a line so far on, a base stands with all wheels on one side of it.
 FOUND_M: Final = 1.0  # A ramp that begins nearer is known: too little floor is left before it to show a start.
 STEEPEST: Final = math.tan(math.radians(10.0))  # ramp that may be driven,
 TOO_STEEP: Final = np.tan(np.radians(np.arange(12.0, 21.0, 2.0)))  # and others, with which it must not be confused
-GENTLEST: Final = math.tan(math.radians(1.0))  # The filter of the tilt follows what is less.
+GENTLEST: Final = math.tan(PRIOR_RAD)  # The filter of the tilt follows what is less.
 STEP: Final = math.tan(math.radians(0.5))  # between slopes that are compared
 STARTS_M: Final = np.arange(0.6, 3.3, 0.1)  # where ramps are looked for: nearer ones are known by their pairs before
 SEEN_M: Final = 4.0  # range up to which they are seen
@@ -228,7 +228,7 @@ class RayScans:
         shown, gradient = both[:, above] * (1 - share) + both[:, above + 1] * share
         difference = lower[rows] - shown
         # 2. Normal equations of the two slopes; single pixels that differ by much count little.
-        sigma = max(1.48 * float(np.median(np.abs(difference[known]))), 0.3)
+        sigma = max(MAD * float(np.median(np.abs(difference[known]))), 0.3)
         weight = known / (1.0 + (difference / (1.5 * sigma)) ** 2)
         squares, products = (weight * gradient * gradient).sum(0), (weight * gradient * difference).sum(0)
         # The gradient has noise of its own: without that share a plain floor would seem to measure something.
