@@ -227,7 +227,7 @@ class ObstacleGrid:
 
         pose (3,): of the base in odom.
         """
-        if self._cell is None:
+        if self._cell is None or not len(ranges_m):
             return np.zeros((len(ranges_m), len(AZIMUTHS)), bool)
         azimuths_rad = AZIMUTHS - self._turn_rad + pose[2]
         unit = np.stack([np.cos(azimuths_rad), np.sin(azimuths_rad)]) / CELL_M

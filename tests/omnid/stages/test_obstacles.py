@@ -56,7 +56,9 @@ class Scans:
 def scans_of(scene: Path) -> list[ObstacleScan]:
     """Return the scans of a rendered run."""
     found, config = Scans(), load_config(None, ["places.enabled=false"])
-    rig = read_rig(scene / "rig.toml").at_height(test_floor.HEIGHT_M)
+    rig = read_rig(scene / "rig.toml")
+    if rig.height_m(config.obstacles.scan.floor_m) is None:
+        rig = rig.at_height(test_floor.HEIGHT_M)
     run_log(scene / "log.mcap", config, ReplayOptions(rig=rig, inline=True, observer=lambda *_: found))
     return found.scans
 
