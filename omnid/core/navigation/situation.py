@@ -65,10 +65,6 @@ class Situation(NamedTuple):
             return self.in_map.T_map_odom
         return np.zeros(3)
 
-    def map_pose(self) -> Array:
-        """Return the pose of the base in the map (3,)."""
-        return self.pose_in(NavigationFrame.MAP)
-
     def pose_in(self, frame: NavigationFrame) -> Array:
         """Return the pose of the base in a frame (3,)."""
         return np.asarray(composed(self.T_frame_odom(frame)[None], self.pose)[0])

@@ -154,7 +154,7 @@ def posterior(
             beyond = log_sum(beyond, begins)
             high = max(high, total[n])
         high = max(high, nearer)
-        # 6. Normalised.
+        # 6. Normalised. What may be nearer hides the first bin, but is no evidence for its place.
         hidden = math.exp(nearer - high)
         last = math.exp(none - high)
         weight = last + hidden

@@ -292,11 +292,11 @@ def test_the_base_drives_backwards_where_the_path_was_driven_so() -> None:
 
 def test_the_base_follows_the_map_when_it_is_corrected() -> None:
     base = DrivenBase(Navigator(NavigationSettings()), 6, T_map_odom=(1.0, -0.5, 0.4))
-    pose = base.seen().map_pose()
+    pose = base.seen().pose_in(NavigationFrame.MAP)
     goal = pose + np.array([3.0, 1.0, 0.2])
     base.navigator.start("goal", NavigationFrame.MAP, [DrivePath((straight_leg(pose, goal),), goal[2])], base.seen())
     base.run(60, lambda answer: answer.left_m < 1.5, rest_s=0)
     base.T_map_odom = base.T_map_odom + np.array([0.1, 0.05, 0.02])
     assert base.run(60).state is NavigationState.REACHED
-    found = base.seen().map_pose()
+    found = base.seen().pose_in(NavigationFrame.MAP)
     assert math.dist(found[:2], goal[:2]) < 0.04 and abs(found[2] - goal[2]) < 0.03
