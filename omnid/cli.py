@@ -26,7 +26,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "run": ("runs", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
     "simulate": ("runs:simulate", "the daemon with a simulated robot in a simulated world"),
     "replay": ("runs:replay", "run a recorded log through the stages of the daemon"),
-    "demo": ("runs:demo", "replay a sample in real time: files, bus and a simulated motor"),
+    "demo": ("runs:demo", "replay a sample in real time, with files and bus"),
     "eval": ("recordings:evaluate_run", "compare a trajectory with the truth, both in the TUM format"),
     "calibrate live": ("calibrate:live", "images of a board, with its coverage and what is missing"),
     "calibrate rig": ("calibrate:of_board", "a rig.toml from images of a board that both cameras saw"),

@@ -117,16 +117,20 @@ def teach(args: argparse.Namespace) -> int:
         granted(robot, driver.route(f"teach {name} replace" if args.replace else f"teach {name}"))
         reports = robot.subscribe(NavigationReport)
         print(f"records {name}: drive it; Enter writes it, Ctrl-C drops it", flush=True)
-        # 2. Show its length until Enter or Ctrl-C.
+        # 2. Show its length until Ctrl-C, or until Enter finds it long enough.
         try:
-            while not select.select([sys.stdin], [], [], 0)[0]:
-                report = reports.wait(robot_state.REPEAT_S)
-                if report is not None and report.teaching != name:
-                    raise OmnidError(f"the recording of {name} has ended: {report.refusal or 'by another program'}")
-                if report is not None:
-                    HANDLER.show(f"{report.taught_m:.1f} m")
-            sys.stdin.readline()
-            granted(robot, driver.route("finish"))
+            while True:
+                while not select.select([sys.stdin], [], [], 0)[0]:
+                    report = reports.wait(robot_state.REPEAT_S)
+                    if report is not None and report.teaching != name:
+                        raise OmnidError(f"the recording of {name} has ended: {report.refusal or 'by another program'}")
+                    if report is not None:
+                        HANDLER.show(f"{report.taught_m:.1f} m")
+                is_open, finished = bool(sys.stdin.readline()), driver.route("finish")
+                if finished.done or not is_open:
+                    granted(robot, finished)
+                    break
+                print(finished.text, flush=True)
         except KeyboardInterrupt:
             driver.route("stop")
             HANDLER.show("")

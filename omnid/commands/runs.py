@@ -201,7 +201,7 @@ def replay_and_print(log: Path, config: Config, asked: ReplayOptions, args: argp
 
 @options.command(options.VERBOSE, options.QUIET, options.SETTINGS)
 def demo(args: argparse.Namespace) -> int:
-    """Replay a sample in real time, with files, bus and a simulated motor, and print its errors; or drive.
+    """Replay a sample in real time, with files and bus, and print its errors; or drive.
 
     --output FOLDER=omnid-demo  folder of the output files
     --drive                     a simulated robot is taught a route of 6 m and repeats it; takes a minute or two, and
@@ -226,7 +226,6 @@ def demo(args: argparse.Namespace) -> int:
         paced=True,
         settings=args.config,
     )
-    args.set = ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.set]
     config = options.settings_of(args)
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:

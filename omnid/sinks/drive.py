@@ -53,7 +53,7 @@ def navigation_answers(update: NavigationUpdate) -> Answers | None:
     if update.answer is None:
         return None
     refusal, state = update.answer.refusal, f"{update.state}: {update.reason}" if update.reason else str(update.state)
-    return {update.answer.id: Answer(not refusal, refusal or f"{update.answer.request}: {state}")}
+    return {update.answer.id: Answer(not refusal, refusal or f"accepted; navigation: {state}")}
 
 
 class ReplayDrive:

@@ -179,7 +179,7 @@ class NavigationStage:
             case NavigationVerb.CANCEL:
                 navigator.cancel("by a request")
             case NavigationVerb.PAUSE:
-                navigator.pause(f"paused by a request: {RESUME}")
+                _raise_if(navigator.pause(f"by a request: {RESUME}"))
             case NavigationVerb.RESUME:
                 _raise_if(navigator.resume(self._situation()))
             case GoalRequest() | PathRequest():

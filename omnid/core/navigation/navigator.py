@@ -44,6 +44,7 @@ LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, b
 NEARER_M: Final = 1.0  # After this progress the next block is a new one.
 
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
+NO_DRIVE: Final = "nothing is under way: give a goal, or repeat a route"
 AROUND: Final = "it looks for a way around an obstacle"
 WAITS: Final = "it goes on by itself when the way is free"
 OBSTRUCTED: Final = "an obstacle is on the path"
@@ -222,16 +223,18 @@ class Navigator:
         if self.drive is not None:
             self._end(NavigationState.CANCELLED, reason)
 
-    def pause(self, reason: str) -> None:
-        """Stop until `resume`."""
-        if self.drive is not None:
-            self.drive.paused = self.drive.paused or reason
-            self.state, self.reason = NavigationState.PAUSED, self.drive.paused
+    def pause(self, reason: str) -> str:
+        """Stop until `resume`; return the reason if that is refused, else an empty text."""
+        if self.drive is None:
+            return NO_DRIVE
+        self.drive.paused = self.drive.paused or reason
+        self.state, self.reason = NavigationState.PAUSED, self.drive.paused
+        return ""
 
     def resume(self, now: Situation) -> str:
         """Continue a paused drive; return the reason if that is refused, else an empty text."""
         if self.drive is None:
-            return "nothing is under way: give a goal, or repeat a route"
+            return NO_DRIVE
         refusal = refusal_to_drive(now, NavigationFrame.ODOM, math.inf)
         if not refusal:
             self.drive.paused, self.drive.stop_count = "", now.wheels.stop_count

@@ -267,6 +267,25 @@ def test_a_drive_is_cancelled_when_its_command_is_ended(
         assert cancelled == ["cancel"] and process.returncode == 1
 
 
+def test_a_route_that_is_too_short_is_taught_on() -> None:
+    endpoint, asked = free_endpoint(), list[str]()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+
+        def take(request: Request) -> None:
+            asked.append(string_from_cdr(request.payload))
+            bus.answer(request.id, Answer(asked != ["teach hall", "finish"], "too short"))
+
+        bus.subscribe_commands(take)
+        command = [sys.executable, "-c", HEARS_ALL, "route", "teach", "hall", "--connect", endpoint]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdin is not None and process.stdout is not None
+            for line in ("records hall: drive it; Enter writes it, Ctrl-C drops it\n", "too short\n"):
+                assert process.stdout.readline() == line
+                print(file=process.stdin, flush=True)
+            assert process.communicate(timeout=30.0)[0] == "hall is written\n"
+    assert asked == ["teach hall", "finish", "finish"] and process.returncode == 0
+
+
 LIMITS = VelocityLimits(velocity_mps=1.0, yaw_rate_radps=2.0)
 UP = b"\x1b[A"
 

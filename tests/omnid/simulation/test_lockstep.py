@@ -217,7 +217,7 @@ def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, caps
         with Robot(connect=connect[1]) as robot:
             assert robot.driver().goal(0.2, 0.0).done
         assert [main(["goto", word, *connect]) for word in ("--pause", "--resume")] == [0, 0]
-        assert "paused by a request: `omnid goto --resume`" in capsys.readouterr().out
+        assert "paused: by a request: `omnid goto --resume`" in capsys.readouterr().out
         with stopped_by_turns(daemon.process, RUNNING_S, STOPPED_S):
             reached = main(["goto", *GOAL, *connect])
         status = newest(port)

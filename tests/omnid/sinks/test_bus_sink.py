@@ -224,7 +224,7 @@ def test_no_pose_of_a_replay_drives_before_its_rig_is_checked(link: Any) -> None
 def test_setpoints_and_answers_of_the_navigation_are_sent(link: Any) -> None:
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
     refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
-    assert navigation_answers(update) == {4: Answer(True, "pause: paused: by a request")}
+    assert navigation_answers(update) == {4: Answer(True, "accepted; navigation: paused: by a request")}
     assert navigation_answers(refused) == {5: Answer(False, "no route lost")}
     for each in (update, refused):
         send_setpoint(link, each)

@@ -182,6 +182,7 @@ def test_a_refusal_names_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert "navigation.reach_m" in refusal(GoalRequest(ODOM, 500.0, 0.0))
     assert "begins 5.0 m away" in refusal(PathRequest(ODOM, np.array([[5.0, 0.0], [6.0, 0.0]])))
     assert "nothing is under way" in refusal(NavigationVerb.RESUME)
+    assert "nothing is under way" in refusal(NavigationVerb.PAUSE)
     assert "no route is being taught" in refusal(RouteRequest(RouteAction.FINISH))
     robot.stage.process(WheelState(False, True, "a stop was asked for"))
     assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))

@@ -152,7 +152,7 @@ class Walk:
                 self.wanted = False
             case RouteRequest(RouteAction.STOP) if not teaching:
                 self.wanted = False
-            case NavigationVerb.PAUSE:
+            case NavigationVerb.PAUSE if accepted:
                 self.paused = True
             case NavigationVerb.RESUME if accepted:
                 self.paused = False
