@@ -10,7 +10,6 @@
   const charts = [];
 
   const clock = (t) => `${+t.toFixed(2)} s`;
-  };
   const number = (v) => v == null ? "" : String(+v.toPrecision(4));
 
   const range = (_, low, high) => {  // of linear values, with some room

@@ -107,7 +107,7 @@ function showWell(state) {
   const pose = state.pose === null || !state.fresh;
   line.hidden = false;
   line.className = worst ? LEVELS[worst.level] : pose ? "warn" : "good";
-  line.textContent = worst ? `${worst.name}: ${worst.message}${more}` : pose ? `There is no pose: ${state.state}.`
+  line.textContent = worst ? `${worst.name}: ${worst.message}${more}` : pose ? "It reports no pose now."
     : `All is well. ${moves}`;
 }
 

@@ -15,7 +15,7 @@ export function wireGoal(plan) {
   let busy = false; // a drive is under way
   let resets = null; // of odometry, when the goal was chosen: another odom has another origin
 
-  const say = (text) => { byId("goal-answer").textContent = text; };
+  const say = (text) => { byId("answer").textContent = text; };
 
   function describe() {
     const { x, y, yaw } = plan.goal;
@@ -63,14 +63,14 @@ export function wireGoal(plan) {
     busy = true;
     showButtons();
     const numbers = [x, y, ...(yaw === null ? [] : [degrees(yaw)])].map((value) => fixed(value, 3));
-    const answer = await ask("goal", [...numbers, state.server_ms].join(" "), "goal-answer");
+    const answer = await ask("goal", [...numbers, state.server_ms].join(" "), "answer");
     if (answer.done) return;
     busy = false;
     plan.setGoal(null);
     showButtons();
   });
 
-  leave.addEventListener("click", () => choosing ? leaveIt() : ask("navigation", "cancel", "goal-answer"));
+  leave.addEventListener("click", () => choosing ? leaveIt() : ask("navigation", "cancel", "answer"));
 
   return {
     show(next) {
@@ -89,7 +89,7 @@ export function wireGoal(plan) {
       if (before && !busy && !choosing) {
         plan.setGoal(null);
         const why = report.reason ? `: ${report.reason}` : "";
-        say(`It has ended: ${report.state}${why}.`);
+        say(`The drive has ended: ${report.state}${why}.`);
       }
       showButtons();
     },

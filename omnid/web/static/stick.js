@@ -48,7 +48,7 @@ export function wireStick() {
     const body = `${wish[0].toFixed(3)} ${wish[1].toFixed(3)} ${state.server_ms} ${page}`.replaceAll("-0.000", "0.000");
     const answer = await post("drive", body);
     sending = false;
-    byId("stick-answer").textContent = answer.text;
+    byId("answer").textContent = answer.text;
   }
 
   pad.addEventListener("pointerdown", (event) => {

@@ -175,6 +175,12 @@ def test_a_report_compares_with_the_truth_as_eval_does(tmp_path: Path) -> None:
     assert "Against the truth" in Page(html_of(log, truth)).text
 
 
+def test_scripts_close_their_brackets() -> None:
+    for script in SAMPLE.parent.rglob("*.js"):
+        text = script.read_text("utf-8")
+        assert list(map(text.count, "([{")) == list(map(text.count, ")]}")), script
+
+
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 

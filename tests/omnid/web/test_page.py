@@ -240,7 +240,7 @@ def held(page: Any, until: Callable[[], object], what: str) -> None:
     """Wait with the page alive until something happens."""
     end_s = time.monotonic() + PATIENCE_S
     while not until():
-        assert time.monotonic() < end_s, f"{what}: {page.inner_text('#pose')} {page.inner_text('#stick-answer')}"
+        assert time.monotonic() < end_s, f"{what}: {page.inner_text('#pose')} {page.inner_text('#answer')}"
         page.wait_for_timeout(50)
 
 
@@ -286,7 +286,7 @@ def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, s
         page.mouse.move(middle[0], 5)
         page.mouse.up()
         held(page, lambda: rests(page), "the stop")
-        shows(page, "stick-answer", "the stick is released")
+        shows(page, "answer", "the stick is released")
         # 2. The keys; a page that loses the focus has released them.
         before = heading_deg(page)
         page.keyboard.down("ArrowLeft")
@@ -302,14 +302,14 @@ def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, s
         page.mouse.down()
         page.mouse.move(plan["x"] + 0.5 * plan["width"] + 50, plan["y"] + 0.4 * plan["height"])
         page.mouse.up()
-        shows(page, "goal-answer", "Go drives there, around obstacles.")
+        shows(page, "answer", "Go drives there, around obstacles.")
         assert position(page) == pytest.approx((x, y), abs=0.02)
         screenshot(page, f"{size}-goal")
         page.click("#goal-go")
-        shows(page, "goal-answer", "it drives to the goal")
+        shows(page, "answer", "accepted; navigation: driving")
         held(page, lambda: math.dist(position(page), (x, y)) > 0.1, "the drive to the goal")
         page.click("#goal-leave")
-        shows(page, "goal-answer", "cancelled")
+        shows(page, "answer", "cancelled")
         # 4. Stops, by the button and by a key.
         press("#stop")
         shows(page, "stop-answer", "the robot stops")
