@@ -62,9 +62,9 @@ _u32 = ctypes.c_uint32
 _Fields: TypeAlias = list[tuple[str, type[Any]]]
 
 
-def _words(names: str, kind: type[Any] = _u32) -> _Fields:
-    """Return fields of 32 bits each."""
-    return [(name, kind) for name in names.split()]
+def _u32s(names: str) -> _Fields:
+    """Return fields of type __u32."""
+    return [(name, _u32) for name in names.split()]
 
 
 class DeviceCapability(ctypes.Structure):
@@ -74,7 +74,7 @@ class DeviceCapability(ctypes.Structure):
     _fields_ = (
         *_names,
         ("bus_info", ctypes.c_char * 32),
-        *_words("version capabilities device_caps"),
+        *_u32s("version capabilities device_caps"),
         ("others", _u32 * 3),
     )
 
@@ -82,13 +82,13 @@ class DeviceCapability(ctypes.Structure):
 class Fraction(ctypes.Structure):
     """struct v4l2_fract."""
 
-    _fields_ = _words("numerator denominator")
+    _fields_ = _u32s("numerator denominator")
 
 
 class PixelFormat(ctypes.Structure):
     """struct v4l2_pix_format; others: size of the image, colours."""
 
-    _fields_ = (*_words("width height pixelformat field bytesperline"), ("others", _u32 * 7))
+    _fields_ = (*_u32s("width height pixelformat field bytesperline"), ("others", _u32 * 7))
 
 
 class _AnyFormat(ctypes.Union):
@@ -104,13 +104,13 @@ class Format(ctypes.Structure):
 class StreamParameters(ctypes.Structure):
     """struct v4l2_streamparm with the capture branch of its union of 200 bytes, struct v4l2_captureparm."""
 
-    _fields_ = (*_words("type capability mode"), ("timeperframe", Fraction), ("others", _u32 * 46))
+    _fields_ = (*_u32s("type capability mode"), ("timeperframe", Fraction), ("others", _u32 * 46))
 
 
 class BufferRequest(ctypes.Structure):
     """struct v4l2_requestbuffers."""
 
-    _fields_ = _words("count type memory capabilities flags")
+    _fields_ = _u32s("count type memory capabilities flags")
 
 
 class _Timeval(ctypes.Structure):
@@ -124,9 +124,9 @@ class _BufferMemory(ctypes.Union):
 class V4l2Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
-    _begin: ClassVar[_Fields] = [*_words("index type bytesused flags field"), ("timestamp", _Timeval)]
-    _timecode: ClassVar[_Fields] = [("timecode", _u32 * 4), *_words("sequence memory")]
-    _fields_ = (*_begin, *_timecode, ("m", _BufferMemory), *_words("length reserved request_fd"))
+    _begin: ClassVar[_Fields] = [*_u32s("index type bytesused flags field"), ("timestamp", _Timeval)]
+    _timecode: ClassVar[_Fields] = [("timecode", _u32 * 4), *_u32s("sequence memory")]
+    _fields_ = (*_begin, *_timecode, ("m", _BufferMemory), *_u32s("length reserved request_fd"))
 
     @property
     def stamp_ns(self) -> int:
@@ -137,8 +137,8 @@ class V4l2Buffer(ctypes.Structure):
 class QueryControl(ctypes.Structure):
     """struct v4l2_queryctrl."""
 
-    _values: ClassVar[_Fields] = _words("minimum maximum step default_value", Int32)
-    _fields_ = (*_words("id type"), ("name", ctypes.c_char * 32), *_values, *_words("flags reserved1 reserved2"))
+    _values: ClassVar[_Fields] = [(name, Int32) for name in ("minimum", "maximum", "step", "default_value")]
+    _fields_ = (*_u32s("id type"), ("name", ctypes.c_char * 32), *_values, *_u32s("flags reserved1 reserved2"))
 
 
 class V4l2Control(ctypes.Structure):

@@ -154,7 +154,7 @@ def status(boards: LiveBoards, outcome: PairOutcome) -> DiagnosticStatus:
     values = {Key.PAIRS: str(boards.pairs), Key.NEEDED: str(NEEDED_PAIRS)}
     for key, coverage in zip((Key.LOWER_COVERAGE, Key.UPPER_COVERAGE), boards.coverage, strict=False):
         values[key] = "".join(str(min(9, count)) for count in coverage.counts.ravel())
-    return entry(CALIBRATION, {**values, Key.MISSING: "; ".join(boards.missing()), "_words": outcome})
+    return entry(CALIBRATION, {**values, Key.MISSING: "; ".join(boards.missing()), "_ok": outcome})
 
 
 def newest_pairs(lower: FrameSource, upper: FrameSource) -> Iterator[tuple[Image, Image]]:

@@ -145,8 +145,8 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
     lost, degraded, notable = states[TrackingState.LOST], states[TrackingState.DEGRADED], NOTABLE_SHARE * poses
     unpaired = min(stats["unpaired_lower"], stats["unpaired_upper"])
     # 1. Images and their stamps.
-    if stats["_fault"]:
-        yield f"{stats['broken']} images could not be used; the first: {stats['_fault']}"
+    if stats["_first_error"]:
+        yield f"{stats['broken']} images could not be used; the first: {stats['_first_error']}"
     if not stats["pairs"] and not unpaired:
         yield "no pair of images: a camera has none that can be used"
     if unpaired > stats["pairs"]:
@@ -232,7 +232,7 @@ class StatusCollector:
         state, fault = newest.state, newest.image_fault
         if newest.light.is_too_dark and state != TrackingState.LOST:
             fault = "it is too dark"
-        of_tracking = "_warning" if fault else "_words"
+        of_tracking = "_warning" if fault else "_ok"
         severity = {TrackingState.LOST: "_error", TrackingState.TRACKING: of_tracking}.get(state, "_warning")
         age_s = self._age_s(newest.stamp_ns)
         return {
@@ -258,7 +258,7 @@ class StatusCollector:
         frozen = stats["_frozen"]
         warnings = {
             f"no images of the {' and the '.join(missing)} camera": missing,
-            f"images cannot be decoded; the first: {stats['_fault']}": broken_hz > 0,
+            f"images cannot be decoded; the first: {stats['_first_error']}": broken_hz > 0,
             f"the images of the {frozen} camera are frozen: check the camera and its driver": frozen,
             "too slow: the computer leaves images out; close other programs, or start omnid with --profile small": (
                 dropped_hz > NOTABLE_SHARE * (processed_hz + dropped_hz)
@@ -277,7 +277,7 @@ class StatusCollector:
             Key.AGE_S: age_s,
             **{key: getattr(state, key) for key in counts},
             "_error": state.problem or "lost" if state.status == "lost" else "no new image" if is_late else "",
-            "_words": state.status,
+            "_ok": state.status,
         }
 
 
@@ -296,7 +296,7 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         words = f"stopped: {state.obstacle}"
     has_failed = state.reason != AWAITED and (state.reason == FAILED or state.failed or state.fault)
     is_unwanted = slow or stop not in ("", IDLE, ASKED, COMMAND_STALE, STARTED)
-    severity = "_error" if has_failed else "_warning" if is_unwanted else "_words"
+    severity = "_error" if has_failed else "_warning" if is_unwanted else "_ok"
     # 2. The numbers.
     counts = ("sent", "late", "missed", Key.ERRORS, Key.EXPIRIES, "fault", "obstacle", "problem")
     arm = "send cmd/arm: `omnid arm`" if state.needs_request else ""

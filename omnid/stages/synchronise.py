@@ -25,8 +25,8 @@ Image = NDArray[np.uint8]
 RECENT: Final = 30  # pairs, and steps between the stamps of a camera, by which skew and period are known
 STAMP_SIGMA_NS: Final = 1_500_000  # scatter of the stamps of cameras that are triggered together, before it is known
 FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
-MAX_WAITING: Final = 4  # frames of a camera that wait: the other camera may be delivered a few periods later
-MOST_WAITING: Final = 4096  # samples of wheels and gyro: ten seconds of a gyro of 400 Hz
+MAX_FRAMES: Final = 4  # of a camera that wait: those of the other may be delivered a few periods later
+MAX_SAMPLES: Final = 4096  # of wheels and gyro that wait: ten seconds of a gyro of 400 Hz
 AHEAD_NS: Final = 5 * NS_PER_S  # a sample that is later than a pair by more has a stamp of another clock
 
 
@@ -56,14 +56,14 @@ class Skew:
 class Decoder:
     """Grey images of the size that the rig was calibrated for.
 
-    `broken` counts the frames that could not be used, `fault` is the reason of the first of them.
+    `broken` counts the frames that could not be used, `first_error` is the reason of the first of them.
     """
 
     def __init__(self, rig: Rig) -> None:
         self._sizes: dict[Camera, tuple[int, int]] = {"lower": rig.lower.camera.size, "upper": rig.upper.camera.size}
         self._fitted: set[Camera] = set()
         self.broken = 0
-        self.fault = ""
+        self.first_error = ""
 
     def __call__(self, frame: Frame) -> Image | None:
         """Return the image (H, W), or None for a frame that cannot be used.
@@ -76,21 +76,21 @@ class Decoder:
             if found == expected:
                 self._fitted.add(frame.camera)
                 return image
-            fault = f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before"
+            error_text = f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before"
             if frame.camera not in self._fitted:
                 raise OmnidError(
                     f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
-                    f"{expected[1]} px: it is that of other cameras; name the rig.toml of these, or calibrate them"
+                    f"{expected[1]} px: the rig is of other cameras; name the rig.toml of these, or calibrate them"
                 )
         except FrameDecodeError as error:
-            fault = str(error)
+            error_text = str(error)
         self.broken += 1
-        self.fault = self.fault or fault
+        self.first_error = self.first_error or error_text
         return None
 
 
 class MotionInbox:
-    """Samples of wheels and gyro on their way to the next pair: a bounded queue, whose oldest samples give way.
+    """Samples of wheels and gyro on their way to the next pair: a bounded queue that drops its oldest samples.
 
     `add` may be called from any thread: samples come faster than images, from several sources, and must not replace
     each other, as the messages in a stage's inbox do.
@@ -99,9 +99,9 @@ class MotionInbox:
     def __init__(self, R_base_imu: NDArray[np.float64] | None = None) -> None:
         """R_base_imu: rotation (3, 3) from the axes of the gyro to those of the base; None: they are the same."""
         self._R_base_imu = R_base_imu
-        self._waiting: deque[MotionSample] = deque(maxlen=MOST_WAITING)
+        self._waiting: deque[MotionSample] = deque(maxlen=MAX_SAMPLES)
         self.wheels = self.gyro = 0  # samples that have come
-        self.dropped = 0  # because none took them, their stamps are far ahead, or their rates are not finite
+        self.dropped = 0  # because no pair took them, their stamps are far ahead, or their rates are not finite
 
     def add(self, sample: MotionSample) -> None:
         """Add a sample, unless its rates are not finite, which would make the poses not finite too."""
@@ -117,7 +117,7 @@ class MotionInbox:
         if isinstance(sample, GyroSample) and self._R_base_imu is not None and not sample.of_base:
             x, y, z = (self._R_base_imu @ rates).tolist()
             sample = GyroSample(sample.stamp_ns, x, y, z, of_base=True)
-        self.dropped += len(self._waiting) == MOST_WAITING
+        self.dropped += len(self._waiting) == MAX_SAMPLES
         self._waiting.append(sample)
 
     def take(self, stamp_ns: int) -> tuple[MotionSample, ...]:
@@ -208,7 +208,7 @@ class Synchronise:
             "skew_ms": self.skew.median_ns * 1e-6,
             "exposure_skew_ms": self.skew.exposure_ns * 1e-6,
             "tolerance_ms": self._tolerance_ns * 1e-6,  # largest difference between the stamps of a pair
-            "_fault": self._decode.fault,  # reason why the first of the broken images could not be decoded
+            "_first_error": self._decode.first_error,  # reason why the first of the broken images could not be decoded
             "_frozen": " and the ".join(name for name, one in cameras if one.repeated_in_a_row >= FROZEN_IMAGES),
         }
 
@@ -224,7 +224,7 @@ class Synchronise:
     @property
     def _tolerance_ns(self) -> float:
         periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.steps_ns]
-        # Before the period is known, only what the scatter of the stamps explains.
+        # Before the period is known, the tolerance is what the scatter of the stamps explains.
         return round(self._config.tolerance_ms * 1e6) or min(periods_ns, default=8 * STAMP_SIGMA_NS) / 2
 
     def process(self, message: Frame | MotionSample) -> FramePair | None:
@@ -251,8 +251,8 @@ class Synchronise:
                     one.waiting.remove(frame)
             if images[0] is not None and images[1] is not None:
                 return self._joined(frames, (images[0], images[1]))
-        # 3. Only a few wait.
-        camera.drop_until(MAX_WAITING)
+        # 3. The oldest that wait beyond a number are given up.
+        camera.drop_until(MAX_FRAMES)
         return None
 
     def finish(self) -> tuple[()]:

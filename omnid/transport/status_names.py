@@ -1,7 +1,7 @@
 """The entries of `<robot>/status`: names, keys, how severe what a part reports is, and what to do.
 
-A part of the robot gives its numbers and states (`stats()`), with units in their keys; WORDS says what they mean. A
-part that is not in WORDS gives words by the key _error, _stale or _warning, which is the severity, or else _words.
+A part of the robot gives its numbers and states (`stats()`), with units in their keys; MESSAGES says what they
+mean. A part that is not in MESSAGES gives its message by a key that is the severity: _error, _stale, _warning or _ok.
 Every number is a value of its own, written as a decimal number. Messages are for people: programs do not parse them,
 and they hold no number that changes from one report to the next. Keys that begin with "_" are not published.
 """
@@ -100,7 +100,7 @@ CAPTURE_TO_POSE: Final = "capture_to_pose"
 TICK_LATE: Final = "tick_late"
 
 Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys, and words
-SAYS: Final = {"_error": ERROR, "_stale": STALE, "_warning": WARN, "_words": OK}  # severity of words by their key
+LEVELS: Final = {"_error": ERROR, "_stale": STALE, "_warning": WARN, "_ok": OK}  # of a message by its key
 
 HINDERED: Final = (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED)
 
@@ -110,8 +110,8 @@ def state_and_reason(stats: Stats) -> str:
     return f"{stats['state']}: {stats['reason']}" if stats["reason"] else str(stats["state"])
 
 
-# What the numbers of a part mean: the first words that are not empty, and their severity.
-WORDS: Final[Mapping[str, Mapping[int, Callable[[Stats], object]]]] = {
+# What the numbers of a part mean: the first message that is not empty, and its severity.
+MESSAGES: Final[Mapping[str, Mapping[int, Callable[[Stats], object]]]] = {
     NAVIGATION: {
         ERROR: lambda stats: stats["state"] == NavigationState.FAILED and state_and_reason(stats),
         WARN: lambda stats: stats["state"] in HINDERED and state_and_reason(stats),
@@ -155,9 +155,9 @@ REMEDIES: Final[Mapping[str, str]] = {
 def entry(name: str, stats: Stats) -> DiagnosticStatus:
     """Return the entry of a part: its numbers, and level, words and advice; a part with a state alone reports that."""
     state = str(stats.get(Key.STATE, ""))
-    said = [(level, str(stats[key])) for key, level in SAYS.items() if stats.get(key)]
-    said += [(level, str(text)) for level, words in WORDS.get(name, {}).items() if (text := words(stats))]
-    level, message = said[0] if said else (ERROR if state == MapState.LOST else OK, state)
+    found = [(level, str(stats[key])) for key, level in LEVELS.items() if stats.get(key)]
+    found += [(level, str(text)) for level, text_of in MESSAGES.get(name, {}).items() if (text := text_of(stats))]
+    level, message = found[0] if found else (ERROR if state == MapState.LOST else OK, state)
     values = {key: value for key, value in stats.items() if not key.startswith("_")}
     remedy = REMEDIES.get(CAMERAS if name.endswith(" camera") else name)
     if level != OK and remedy and not values.get(Key.REMEDY):

@@ -20,7 +20,7 @@ from drivers.logs.log_reader import LogCameras, LogReader
 from drivers.motion import GyroSample, WheelSample
 from omnid.config import PairConfig
 from omnid.messages import FramePair
-from omnid.stages.synchronise import MAX_WAITING, MotionInbox, Skew, Synchronise
+from omnid.stages.synchronise import MAX_FRAMES, MotionInbox, Skew, Synchronise
 from tests.simulation import build, write_log
 from tests.simulation.logs import Readout
 from tests.simulation.rigs import with_upper_rotated
@@ -88,7 +88,7 @@ def test_pairs_frames_in_the_order_of_their_stamps(
 def test_pairs_again_after_a_camera_was_away(pair: Synchronise) -> None:
     assert len(made(pair, shot("lower", 0), shot("upper", 0))) == 1
     assert made(pair, *(shot("upper", index) for index in range(1, 1000))) == []
-    assert sum(unpaired(pair)) >= 999 - MAX_WAITING, "few frames wait"
+    assert sum(unpaired(pair)) >= 999 - MAX_FRAMES, "few frames wait"
     assert pair.newest_ns["lower"] < pair.newest_ns["upper"]
     back = [frame for index in range(1000, 1010) for frame in (shot("lower", index), shot("upper", index))]
     assert len(made(pair, *back)) == 10
