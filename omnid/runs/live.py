@@ -188,7 +188,9 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
         outputs = replace(outputs, recorder=recorder)
     if config.bus.panorama_hz:
         outputs.poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns)
-    outputs.poses["rig"] = lambda pose: health.drive(pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure)
+    outputs.poses["rig"] = lambda pose: health.check_drive(
+        pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure
+    )
 
     # 3. The stages. Samples of gyro and wheels come from the bus, unless they come with the images of a log or of a
     #    simulation, whose motion others would not fit; a motor controller gives those of its wheels.

@@ -84,10 +84,10 @@ class FrontEnd:
         """Return the pose at a pair; RigContradictedError where the images contradict the rig."""
         # 1. Check the rig by the pair; where the pixels were exposed at several times, by the pair before: the odometry
         #    has found the motion during its exposures.
-        if pair.times.is_at_once:
-            self.health.begin(pair)
+        if pair.times.is_synchronised:
+            self.health.check_first(pair)
         elif self._unchecked is not None:
-            self.health.begin(self._unchecked.panoramas, self._unchecked.exposure)
+            self.health.check_first(self._unchecked.panoramas, self._unchecked.exposure)
         is_contradicted, is_checking = self.health.state.is_contradicted, self.health.is_checking
         # 2. What wheels and gyro have measured since the pair before.
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
@@ -122,7 +122,7 @@ class FrontEnd:
             state = TrackingState.DEGRADED
         update = self._update(pair, estimate, state)
         # 6. Whether the next pair is to be checked.
-        self._unchecked = update.depth if is_checking and not pair.times.is_at_once else None
+        self._unchecked = update.depth if is_checking and not pair.times.is_synchronised else None
         return update
 
     def complete(self) -> None:

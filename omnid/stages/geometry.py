@@ -211,7 +211,7 @@ class DenseDepths:
 
         exposure: the motion during the exposures; None: unknown.
         """
-        exposure = None if exposure is None or exposure.times.is_at_once else exposure
+        exposure = None if exposure is None or exposure.times.is_synchronised else exposure
         return self._cached(panoramas, exposure, partial(self._compute, panoramas, exposure))
 
     def _cached(self, panoramas: Panoramas, key: object, compute: Callable[[], DensePoints]) -> DensePoints:

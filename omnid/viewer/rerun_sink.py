@@ -33,8 +33,8 @@ from omnid.transport.topics import PUBLISHED, SCAN
 
 Array: TypeAlias = NDArray[np.float64]
 TIMELINE: Final = "stamp"
-# Drawn in full at first, then every 2nd, 4th, 8th ... after each further so many.
-MOST: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50}
+# Messages of a kind that are drawn in full; after each further such number every 2nd, 4th, 8th ... is drawn.
+MAX_DENSE: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50}
 MAP_POINTS, RIG_POINTS = 50_000, 3_000
 # Colours, and sizes on the screen: the radii of lines and points, which do not depend on the distance [px]; of the path
 # by the state: the worse, the thicker.
@@ -149,7 +149,7 @@ class RerunSink:
 
     def wants(self, kind: str) -> bool:
         """Return whether the next message of a kind is to be drawn."""
-        is_due: bool = self._offered[kind] % 2 ** (self._drawn[kind] // MOST[kind]) == 0
+        is_due: bool = self._offered[kind] % 2 ** (self._drawn[kind] // MAX_DENSE[kind]) == 0
         self._offered[kind] += 1
         self._drawn[kind] += is_due
         return is_due

@@ -78,7 +78,7 @@ class Exposure:
 
     def shift(self, points: Array) -> ViewShift:
         """Return the shifts of points (N, 3) [m] in the rectified frame at the stamp."""
-        if self.times.is_at_once:
+        if self.times.is_synchronised:
             none = np.zeros((len(points), 2))
             return ViewShift(none, none, np.zeros((len(points), 4, 0)))
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
@@ -104,7 +104,7 @@ class Exposure:
         Also the spread (N,) [px] of the columns, twice the standard deviation by the uncertainty of the velocity. NaN
         where the disparity is unknown.
         """
-        if self.times.is_at_once:
+        if self.times.is_synchronised:
             return np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]), np.zeros(len(pixels))
         known = np.flatnonzero(disparity > 0)
         views = np.column_stack([pixels, pixels[:, 1] + disparity])[known]
@@ -122,7 +122,7 @@ class Exposure:
         turn.
         """
         views = seen = np.column_stack([pixels, rows])
-        if self.times.is_at_once:
+        if self.times.is_synchronised:
             return views, self.shift(views)
         for _ in range(ROUNDS):
             points = triangulate(views, self.model.cylinder, self.model.baseline_m)

@@ -139,7 +139,7 @@ class ImageBreaks:
         is_broken = self._torn > DECIDING_COST or self._open is not None
         is_usual = costs is not None and costs[1] * (costs[0] - self._usual_cost) < DECIDING_COST and not is_broken
         # A pose that was only predicted says too little about the motion between several exposures.
-        is_known = exposure.times.is_at_once or (costs is not None and exposure.is_known)
+        is_known = exposure.times.is_synchronised or (costs is not None and exposure.is_known)
         if last is not None and dt_s > 0 and is_known and last.exposure.is_known and not is_usual:
             flow = _flow((last, now), self._raws, local_map, self._model, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow)

@@ -219,7 +219,7 @@ class VisualOdometry:
 
     def _exposure(self, frame: StereoFrame, dt_s: float = 0.0) -> Exposure:
         """Return the exposure of a frame by the filter's velocity, after a step of dt_s was predicted to it."""
-        motion = NO_VELOCITY if frame.times.is_at_once else self._motion.at_exposure(dt_s)
+        motion = NO_VELOCITY if frame.times.is_synchronised else self._motion.at_exposure(dt_s)
         return Exposure(frame.times, motion, self._model)
 
     def _find(self, now: _Prediction) -> list[PoseEstimate]:
@@ -354,7 +354,7 @@ class VisualOdometry:
             self._refused_s = self._unmatched_s = None
             self._miss(now.dt_s, is_lost=True, carried=carried)
             return self._result(0, 0, exposure)
-        self._first = None if now.frame.times.is_at_once else now
+        self._first = None if now.frame.times.is_synchronised else now
         self._motion.found(self._motion.pose_covariance)
         # A map that replaces a lost one says nothing about the motion between the two.
         is_unknown = self._is_unknown or (self._T_at_fix is not None and not carried)

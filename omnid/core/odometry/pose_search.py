@@ -145,7 +145,7 @@ class PoseSearch:
         )
         # The share that the upper camera confirms. Where the cameras expose at several times it is 1: an acceleration
         # that is not known hides rows as well.
-        upper_ratio = float(np.isfinite(rows[chosen]).mean()) if frame.times.is_at_once else 1.0
+        upper_ratio = float(np.isfinite(rows[chosen]).mean()) if frame.times.is_synchronised else 1.0
         return replace(
             estimate,
             visible=visible,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.types.panorama import PaddedPanorama
-from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
+from omnid.core.types.pixel_times import SYNCHRONISED, PixelTimes
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class StereoFrame:
     # The image, or the function that returns it for a motion during the exposures; None: unknown, or synchronised.
     disparities: NDArray[np.float32] | Callable[[Exposure | None], NDArray[np.float32]]
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
-    times: PixelTimes = AT_ONCE
+    times: PixelTimes = SYNCHRONISED
     interval_s: tuple[float, float] | None = None  # since the frame before, by the clock of the motion sensors
     # The motion for which disparities are corrected; None: not known, so that they are as seen.
     exposure: Exposure | None = None

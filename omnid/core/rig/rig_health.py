@@ -120,7 +120,7 @@ class RigFinding:
     matches: int
     tried: int  # points that were searched
     drift: RigDrift | None  # of the upper camera; None: there are fewer than MIN_MATCHES
-    left_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
+    residual_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
 
     @property
     def turn_deg(self) -> float:
@@ -187,7 +187,7 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
     exchanged: number of the matches with the cameras exchanged; 0 if that was not tried.
     """
     lower, upper = np.concatenate([one.lower for one in found]), np.concatenate([one.upper for one in found])
-    drift, misfit_deg, left_px = None, 0.0, math.nan
+    drift, misfit_deg, residual_px = None, 0.0, math.nan
     if len(lower) >= MIN_MATCHES:
         # 1. The rotation and shift of the upper camera that explain the columns; the rotation, or a part of the shift,
         #    less SIGMAS standard deviations counts.
@@ -198,7 +198,7 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
         # 2. Residuals in each direction show changed intrinsics.
         sector = np.floor(cylinder.azimuth(lower[:, 0]) * (SECTORS / math.tau))
         offsets = [abs(np.median(drift.residuals[sector == number])) for number in np.unique(sector)]
-        left_px = float(np.median(offsets)) * cylinder.focal_px
+        residual_px = float(np.median(offsets)) * cylinder.focal_px
     # 3. The state by this finding alone.
     state = RigState.FITS
     if max(len(lower), exchanged) >= MIN_MATCHES and exchanged > len(lower):
@@ -207,13 +207,13 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
         state = RigState.BROKEN
     elif drift is None:
         state = RigState.UNCHECKED
-    elif misfit_deg > DRIFTED_DEG or left_px > DRIFTED_PX:
+    elif misfit_deg > DRIFTED_DEG or residual_px > DRIFTED_PX:
         state = RigState.DRIFTED
-    return RigFinding(state, len(lower), sum(one.tried for one in found), drift, left_px)
+    return RigFinding(state, len(lower), sum(one.tried for one in found), drift, residual_px)
 
 
 class RigHealth:
-    """State of the rig of a run, by first pairs before a pose moves wheels (`begin`) and views of the drive (`drive`).
+    """State of the rig: `check_first` takes pairs before a pose moves wheels, `check_drive` views of the drive.
 
     mode: what a contradiction by the first pairs does: "refuse" raises RigContradictedError, "warn" keeps the reason in
     `warning`, "off" checks no first pairs. Where these show too little, as in darkness, later ones are used, and until
@@ -255,7 +255,7 @@ class RigHealth:
         }
         return words.get(self.state, "")
 
-    def begin(self, pair: Panoramas, exposure: Exposure | None = None) -> None:
+    def check_first(self, pair: Panoramas, exposure: Exposure | None = None) -> None:
         """Use one of the first pairs, some 30 ms of work; RigContradictedError where the mode is to refuse the rig.
 
         A right rig is decided in one round, a contradiction needs two in a row, because a hand before a mirror passes.
@@ -289,12 +289,12 @@ class RigHealth:
         if self._is_contradicted and self._mode == "refuse":
             raise RigContradictedError(self.warning)
 
-    def drive(self, pair: Panoramas, position: Array, exposure: Exposure | None = None) -> None:
+    def check_drive(self, pair: Panoramas, position: Array, exposure: Exposure | None = None) -> None:
         """Use a pair of the drive if it is due; a finding changes the state unless it saw too little.
 
-        position (3,) [m] of the rig in odom; exposure: as in `begin`. The newest views count, so that older ones are
-        forgotten with the path. Only pairs of `begin` show that cameras are exchanged, and no longer. A view of a new
-        place takes 10 to 20 ms, and 20 to 50 ms more from VIEWS of them on, all other pairs almost nothing.
+        position (3,) [m] of the rig in odom; exposure: as in `check_first`. The newest views count, so that older
+        ones are forgotten with the path. Only first pairs show that cameras are exchanged. A view of a new place takes
+        10 to 20 ms, and 20 to 50 ms more from VIEWS of them on, all other pairs almost nothing.
         """
         # 1. A pair that is due, of another place, and whose motion is known.
         is_new = not np.linalg.norm(position - self._view_at) < VIEW_M
@@ -316,4 +316,4 @@ class RigHealth:
 
 def _is_motion_unknown(pair: Panoramas, exposure: Exposure | None) -> bool:
     """True if a pair has several times of exposure and the motion in between, which looks like drift, is unknown."""
-    return not pair.times.is_at_once and (exposure is None or not exposure.is_known)
+    return not pair.times.is_synchronised and (exposure is None or not exposure.is_known)

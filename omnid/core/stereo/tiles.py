@@ -34,13 +34,13 @@ Numbers = NDArray[np.int32]
 TILE_COLUMNS: Final = 60
 TILE_ROWS: Final = 4  # 63 rows at scale 1.
 # Rows and columns from one counted pixel to the next, because a quarter of the pixels is enough in a quarter of the
-# time, where a tile has LEAST_SAMPLES of them: a few may keep their greys by chance, as at 160 px.
+# time, where a tile has MIN_SAMPLES of them: a few may keep their greys by chance, as at 160 px.
 SPACING_PX: Final = 2
-LEAST_SAMPLES: Final = 100
+MIN_SAMPLES: Final = 100
 SATURATED_GREY: Final = 250  # grey level from which a pixel is saturated
 # Share of a tile that must show the world, and share of the judged tiles of a column beyond which its direction is
 # unknown if they are blind.
-MOST: Final = 0.5
+MAJORITY: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +66,7 @@ SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts, because one may be a glitch of a driver
 # Share of the judged tiles that must change before others are dead, because else the whole image is still.
-LEAST_ALIVE: Final = 0.1
+MIN_CHANGED_SHARE: Final = 0.1
 # Share of the mean change by noise that a live tile shows at least, because the noise is that of the smoothest blocks,
 # and pixels of a panorama are interpolated from compressed images: in the sample log it is a fifth.
 NOISE_SHARE: Final = 0.1
@@ -83,7 +83,7 @@ SATURATED_SHARE: Final = 0.8  # of the pixels of a tile.
 # leaves less.
 BLURRED_SHARE: Final = 0.1
 BLURRED_COLUMNS: Final = 3
-LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise, because with less texture no blur is seen.
+MIN_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise, because with less texture no blur is seen.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,12 +126,12 @@ class TileMonitor:
     def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
         """visible (H, W): pixels that show the world; columns of tiles in W."""
         # 1. The sums of each tile; those that show less of the world are not judged.
-        self._spacing_px = SPACING_PX if visible.size >= LEAST_SAMPLES * SPACING_PX**2 * TILE_ROWS * columns else 1
+        self._spacing_px = SPACING_PX if visible.size >= MIN_SAMPLES * SPACING_PX**2 * TILE_ROWS * columns else 1
         self._mask = self._sampled(np.where(visible, np.uint8(255), np.uint8(0)))
         self._rows, self._columns = borders(self._mask.shape[0], TILE_ROWS), borders(self._mask.shape[1], columns)
         self._before: dict[Side, Image] = {}
         self._pixels = self._tile_sums(np.asarray(self._mask & 1, np.uint8))
-        self._judged = self._pixels >= MOST * np.diff(self._rows)[:, None] * np.diff(self._columns)
+        self._judged = self._pixels >= MAJORITY * np.diff(self._rows)[:, None] * np.diff(self._columns)
         self._counts = np.maximum(self._pixels, 1)
         # 2. Pixels at half resolution, all of which show the world, and so do their neighbours.
         height, width = visible.shape[0] // 2, visible.shape[1] // 2
@@ -182,7 +182,7 @@ class TileMonitor:
             blind[side] |= self._judged & self._blurred(side, energy[side], energy[other], noise_grey[other])
         # 3. Directions.
         counts = np.maximum(self._judged.sum(axis=0), 1)
-        columns = {side: dead[side].any(axis=0) | (blind[side].sum(axis=0) > MOST * counts) for side in SIDES}
+        columns = {side: dead[side].any(axis=0) | (blind[side].sum(axis=0) > MAJORITY * counts) for side in SIDES}
         if not any(states[side].any() for states in (dead, blind) for side in SIDES):
             return ALL_LIVE
         return TileStates(dead, blind, columns)
@@ -203,7 +203,7 @@ class TileMonitor:
         is_still = shows & (change <= least)
         lively = self._lively[side]
         may_be_dead = is_still & ((contrast > TEXTURE_GREY) | (lively > LIVELY_SHARE))
-        enough = (shows & ~is_still).sum() >= LEAST_ALIVE * max(1, int(shows.sum()))
+        enough = (shows & ~is_still).sum() >= MIN_CHANGED_SHARE * max(1, int(shows.sum()))
         self._still[side] = np.where(may_be_dead & enough, self._still[side] + 1, 0)
         # While a tile is still, its liveliness stays as it was before.
         self._lively[side] = np.where(self._still[side] > 0, lively, lively + LIVELY_GAIN * (~is_still - lively))
@@ -224,7 +224,7 @@ class TileMonitor:
 
     def _blurred(self, side: Side, energy: Array, other: Array, noise_grey: float) -> Flags:
         """Return the columns (C,) in which a camera shows far less than the other one does."""
-        textured = other > LEAST_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
+        textured = other > MIN_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
         ratio = energy / np.maximum(other, 1e-6)
         is_faint = np.zeros(len(energy), bool)
         # With texture in less than a quarter of a turn, a single poster would decide what is usual.

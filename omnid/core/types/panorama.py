@@ -11,7 +11,7 @@ from drivers.jpeg import Steps
 from drivers.motion import MotionSample
 from omnid.core.stereo.photometry import Light
 from omnid.core.stereo.tiles import ALL_LIVE, TileStates
-from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
+from omnid.core.types.pixel_times import SYNCHRONISED, PixelTimes
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -84,7 +84,7 @@ class Panoramas:
     lower: PaddedPanorama
     upper: PaddedPanorama
     visible: Flags  # (H, W) both cameras show the world here and in a tracking window around
-    times: PixelTimes = AT_ONCE
+    times: PixelTimes = SYNCHRONISED
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     tiles: TileStates = ALL_LIVE  # the parts of the images that are dead or blind

@@ -20,12 +20,12 @@ class PixelTimes:
     """Times of exposure of a pair's panorama pixels, s after the stamp of the pair."""
 
     skew_s: float = 0.0  # time of the upper image's first row relative to the lower one's
-    # (H, W) of each pixel after the first image row; (0, 0): at once
+    # (H, W) of each pixel after the first image row; (0, 0): all at one time
     lower_rows_s: NDArray[np.float32] = field(default_factory=_no_rows)
     upper_rows_s: NDArray[np.float32] = field(default_factory=_no_rows)
 
     @property
-    def is_at_once(self) -> bool:
+    def is_synchronised(self) -> bool:
         """True if all pixels are exposed at the stamp."""
         return self.skew_s == 0 and self.lower_rows_s.size == 0 and self.upper_rows_s.size == 0
 
@@ -38,7 +38,7 @@ class PixelTimes:
         return self.skew_s + _read(self.upper_rows_s, pixels)
 
 
-AT_ONCE: Final = PixelTimes()
+SYNCHRONISED: Final = PixelTimes()
 
 
 def _read(table: NDArray[np.float32], pixels: Array) -> Array:

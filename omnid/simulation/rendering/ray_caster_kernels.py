@@ -21,7 +21,7 @@ MIN_SLANT = np.float32(0.02)  # Least cosine between a ray and a rectangle's nor
 # and the value at the frame's origin; then brightness, texels per m^2, least distance from the origin of any ray, 0.
 ZERO, HALF, ONE, FAR_M = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(np.inf)
 # Fractions u, v of a rectangle: it reaches beyond its outline by the rounding, so that no ray passes between two walls.
-LEAST, MOST = np.float32(-2e-6), np.float32(1.0 + 2e-6)
+LOW_EDGE, HIGH_EDGE = np.float32(-2e-6), np.float32(1.0 + 2e-6)
 # Texels of a sample's footprint above which a smaller level of the texture is read, and of one at the next level.
 FOOTPRINT, QUARTER = np.float32(2.0), np.float32(0.25)
 
@@ -66,7 +66,7 @@ def take_nearer(
         px, py, pz = a[i] + s * x[i], b[i] + s * y[i], c[i] + s * z[i]
         across = u + u0 * px + u1 * py + u2 * pz
         down = v + v0 * px + v1 * py + v2 * pz
-        inside = (across >= LEAST) & (across <= MOST) & (down >= LEAST) & (down <= MOST)
+        inside = (across >= LOW_EDGE) & (across <= HIGH_EDGE) & (down >= LOW_EDGE) & (down <= HIGH_EDGE)
         is_hit = (s > ZERO) & (s < distance[i]) & inside
         distance[i] = s if is_hit else distance[i]
         nearest[i] = number if is_hit else nearest[i]

@@ -51,7 +51,7 @@ class Driver:
         self._health = health
 
     def process(self, panoramas: Panoramas) -> None:
-        self._health.drive(panoramas, np.array([panoramas.seq, 0.0, 0.0]))
+        self._health.check_drive(panoramas, np.array([panoramas.seq, 0.0, 0.0]))
 
 
 class Collector(list[Panoramas]):
@@ -96,7 +96,7 @@ def drive(health: RigHealth, panoramas: Iterable[Panoramas], apart_m: float = 1.
     """Return the state after these views of a drive, PERIOD_S and so far apart."""
     for number, one in enumerate(panoramas):
         stamped = replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS))
-        health.drive(stamped, np.array([number * apart_m, 0.0, 0.0]))
+        health.check_drive(stamped, np.array([number * apart_m, 0.0, 0.0]))
     return health
 
 
@@ -108,7 +108,7 @@ def started(place: Geometry, pairs: Iterable[Panoramas], mode: str = "warn") -> 
     """Return the state after first pairs."""
     health = RigHealth(place.cylinder, mode, PERIOD_S)
     for one in pairs:
-        health.begin(one)
+        health.check_first(one)
     return health
 
 
@@ -153,7 +153,7 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(place: Geometry, true
     for number, right in enumerate(true[1][:8]):
         turned = wrapped(np.roll(right.upper.panorama, columns * (number >= 4), axis=1))
         shown = replace(right, upper=turned, stamp_ns=round(number * PERIOD_S * SECONDS))
-        health.drive(shown, np.array([number, 0.0, 0.0]))
+        health.check_drive(shown, np.array([number, 0.0, 0.0]))
         assert health.state.is_contradicted == (number >= 6), "the newest three views decide"
     assert entry(RIG, rig_stats(health)).level == 2
     assert poses.process(true[1][8]).state is TrackingState.DEGRADED

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
+from omnid.core.types.pixel_times import SYNCHRONISED, PixelTimes
 
 PIXELS = np.array([[0.0, 0.0], [3.4, 1.0], [-1.0, 9.0]])  # the last one across the seam and below the last row
 
 
-def test_pixels_exposed_at_once_have_the_time_of_the_stamp() -> None:
-    assert AT_ONCE.is_at_once and not AT_ONCE.lower(PIXELS).any() and not AT_ONCE.upper(PIXELS).any()
+def test_pixels_of_synchronised_cameras_have_the_time_of_the_stamp() -> None:
+    assert SYNCHRONISED.is_synchronised
+    assert not SYNCHRONISED.lower(PIXELS).any() and not SYNCHRONISED.upper(PIXELS).any()
 
 
 def test_a_late_camera_and_rows_add_up() -> None:
     rows_s = np.arange(8, dtype=np.float32).reshape(2, 4)
     late, rolling = PixelTimes(0.015), PixelTimes(0.015, rows_s, 2 * rows_s)
-    assert not late.is_at_once and not rolling.is_at_once and not PixelTimes(0.0, rows_s, rows_s).is_at_once
+    assert not any(times.is_synchronised for times in (late, rolling, PixelTimes(0.0, rows_s, rows_s)))
     np.testing.assert_allclose(late.upper(PIXELS), 0.015)
     assert not late.lower(PIXELS).any()
     np.testing.assert_array_equal(rolling.lower(PIXELS), [0.0, 7.0, 7.0])
