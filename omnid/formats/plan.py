@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,35 +13,17 @@ from calib.rig import LEAST_HEIGHT_M
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.tum import POSITION_LIMIT_M
 
+if TYPE_CHECKING:  # it takes a second and 30 MB, also of runs that draw no plan
+    from matplotlib.axes import Axes
+
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Colour = tuple[int, int, int]  # BGR
 
-MARGIN_PX = 64
-MARK_PX = 11  # size of marks and distance of labels
+PX_PER_INCH = 100
+MARGIN_PX = 64  # for the ticks and the names of the axes
 SIDE_PX = 1400  # of an image, at most
-WHITE, BLACK, RED, BLUE, LIGHT_GREY = (255, 255, 255), (0, 0, 0), (0, 0, 190), (200, 100, 0), (205, 205, 205)
+MOST_PX_PER_M = 100.0  # of a small map
 _CELL_M = 0.05  # default voxel: at a finer scale cells are drawn as squares, not as scattered dots
-
-
-@dataclass(frozen=True, slots=True)
-class Sheet:
-    """Drawn area in metres and its scale."""
-
-    low_m: Array  # (2,) x, y of the drawn area's lower left corner
-    high_m: Array  # (2,)
-    px_per_m: float
-
-    @property
-    def area_px(self) -> tuple[int, int]:
-        """Width and height of the drawn area."""
-        size = np.floor((self.high_m - self.low_m) * self.px_per_m).astype(int) + 1
-        return int(size[0]), int(size[1])
-
-    def pixels(self, xy_m: Array) -> NDArray[np.int32]:
-        """Return image coordinates (N, 2) of points (N, 2); y grows downwards there."""
-        corner = np.array([MARGIN_PX, MARGIN_PX + self.area_px[1] - 1])
-        return np.asarray(np.rint(corner + (xy_m - self.low_m) * self.px_per_m * [1, -1]), dtype=np.int32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +31,9 @@ class Lines:
     """Lines of one style."""
 
     parts: Sequence[Array]  # each (N, 2) m
-    colour: Colour
-    width_px: int
-    rim_px: int = 0  # width of a white rim; 0: none
+    colour: str
+    width_pt: float
+    name: str = ""  # in the legend
 
 
 def drawn_heights(height_m: float) -> tuple[float, float]:
@@ -73,20 +55,15 @@ def plan_view(
     """Return a BGR image (H, W, 3) of the map's points between two heights [m], and the path (N, 2) [m] over it.
 
     A row of the path that is NaN, or too far away to be drawn, is a gap: what is before and after it is not joined.
-    Heights are z of the points' frame. A cell is the darker, the more confident points it has. Neither side exceeds
-    SIDE_PX. The farthest half per cent of the points on each side may be cut off, the path never.
-    loops_xy: (L, 2, 2) [m] ends of lines between places of the path that were recognised as one.
+    Heights are z of the points' frame. loops_xy: (L, 2, 2) [m] ends of lines between places of the path that were
+    recognised as one.
     """
     drawable = _drawable(trajectory_xy)
     path = trajectory_xy[drawable].astype(np.float64)
-    xy_m, confidence = between(points.xyz, points.confidence, heights_m)
-    sheet = sheet_of(xy_m, path)
     gaps = np.flatnonzero(np.diff(np.flatnonzero(drawable)) > 1) + 1
-    lines = [Lines(np.split(path, gaps), RED, 3, rim_px=7), Lines(list(loops_xy), BLUE, 1)]
-    image = draw_plan(sheet, xy_m, confidence, lines)
-    if len(path):
-        draw_ends(image, sheet, path[0], path[-1])
-    return image
+    pieces = np.split(path, gaps)
+    lines = [Lines(pieces, "white", 5), Lines(pieces, "#be0000", 2), Lines(list(loops_xy), "#0064c8", 1)]
+    return image_of(draw_plan(*between(points.xyz, points.confidence, heights_m), lines, path))
 
 
 def between(
@@ -102,88 +79,57 @@ def _drawable(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray((np.abs(points) <= POSITION_LIMIT_M).all(axis=1))
 
 
-def sheet_of(xy_m: Array, path: Array) -> Sheet:
-    """Return the area of the path and of 99 % of the points: a few false far points must not shrink the rest."""
+def draw_plan(xy_m: Array, confidence: NDArray[np.float32], lines: Sequence[Lines], path: Array) -> Axes:
+    """Return axes in m with points (N, 2), lines over them, and the start and the end of a path (M, 2).
+
+    A cell is the darker, the more confident points it has. The farthest half per cent of the points on each side may be
+    cut off, because a few false far ones must not shrink the rest; lines never are. Neither side exceeds SIDE_PX.
+    """
+    from matplotlib.figure import Figure
+
+    # 1. The area: that of the lines and of most points, at least 2 m, and not so narrow that a straight path vanishes.
     bulk = np.quantile(xy_m, (0.005, 0.995), axis=0) if len(xy_m) else np.empty((0, 2))
-    corners = np.vstack([bulk, path]) if len(bulk) or len(path) else np.zeros((1, 2))
+    corners = np.vstack([bulk, path, *(part for one in lines for part in one.parts)])
+    corners = corners if len(corners) else np.zeros((1, 2))
     low_m, high_m = corners.min(axis=0), corners.max(axis=0)
-    half = np.maximum(1.06 / 2 * (high_m - low_m), 1.0)  # an empty map has 2 m as well
-    half = np.maximum(half, 0.1 * half.max())  # a straight path is visible
-    usable_px = SIDE_PX - 2 * MARGIN_PX - 2
-    centre = (low_m + high_m) / 2
-    return Sheet(centre - half, centre + half, min(usable_px / (2 * float(half.max())), 100.0))
+    half_m = np.maximum(1.06 / 2 * (high_m - low_m), 1.0)
+    half_m = np.maximum(half_m, 0.1 * half_m.max())
+    low_m, high_m = (low_m + high_m) / 2 - half_m, (low_m + high_m) / 2 + half_m
+    px_per_m = min((SIDE_PX - 2 * MARGIN_PX) / (2 * float(half_m.max())), MOST_PX_PER_M)
+    size_px = np.floor(2 * half_m * px_per_m) + 2 * MARGIN_PX
+    figure = Figure(figsize=tuple((size_px / PX_PER_INCH).tolist()), dpi=PX_PER_INCH)
+    axes = figure.add_axes((*(MARGIN_PX / size_px), *(1 - 2 * MARGIN_PX / size_px)))
+    # 2. The points by cells, which are never finer than a voxel: that would leave white lines in a wall.
+    cell_m = np.ceil(px_per_m * _CELL_M) / px_per_m
+    edges = [low + cell_m * np.arange(2 + (high - low) // cell_m) for low, high in zip(low_m, high_m, strict=True)]
+    density = np.histogram2d(xy_m[:, 0], xy_m[:, 1], edges, weights=confidence)[0].T
+    usual = float(np.median(density[density > 0])) if density.any() else 1.0
+    grey = np.where(density > 0, 190.0 - 190.0 * density / (density + usual), 255.0)
+    extent = (edges[0][0], edges[0][-1], edges[1][0], edges[1][-1])
+    axes.imshow(grey, "gray", vmin=0, vmax=255, interpolation="nearest", origin="lower", extent=extent, aspect="auto")
+    # 3. The lines, and both ends of the path.
+    for one in lines:
+        for number, part in enumerate(one.parts):
+            axes.plot(*part.T, color=one.colour, linewidth=one.width_pt, label="" if number else one.name)
+    for point, name, inside, above_pt in ((path[-1:], "end", "black", -18), (path[:1], "start", "white", 10)):
+        for place in point:
+            axes.annotate(name, place, (0, above_pt), textcoords="offset points", ha="center")
+        axes.plot(*point.T, "o", markersize=9, markeredgecolor="black", markerfacecolor=inside)
+    axes.set(xlim=(low_m[0], high_m[0]), ylim=(low_m[1], high_m[1]), xlabel="x forward [m]", ylabel="y left [m]")
+    if any(one.name for one in lines):
+        figure.legend(loc="upper center", ncols=len(lines), frameon=False)
+    return axes
 
 
-def draw_plan(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32], lines: Sequence[Lines]) -> Image:
-    """Return the image of a sheet: points (N, 2) as grey cells, the frame with ticks, and lines over them."""
-    margin = ((MARGIN_PX, MARGIN_PX), (MARGIN_PX, MARGIN_PX), (0, 0))
-    image = np.pad(_cells(sheet, xy_m, confidence), margin, constant_values=255)
-    _draw_frame(image, sheet)
-    for line in lines:
-        parts = [sheet.pixels(part).reshape(-1, 1, 2) for part in line.parts if len(part)]
-        for colour, width_px in ((WHITE, line.rim_px), (line.colour, line.width_px)):
-            if parts and width_px:
-                cv2.polylines(image, parts, False, colour, width_px, cv2.LINE_AA)
-    return image
+def image_of(axes: Axes) -> Image:
+    """Return the figure of axes as a BGR image (H, W, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(axes.figure.figure)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., 2::-1])  # type: ignore[no-untyped-call]
 
 
-def draw_ends(image: Image, sheet: Sheet, start: Array, end: Array | None = None) -> None:
-    """Draw a circle with its name at the start of a path, and one that is filled at its end."""
-    for point, name, inside in ((end, "end", BLACK), (start, "start", WHITE)):
-        if point is not None:
-            ((x, y),) = sheet.pixels(point[None]).tolist()
-            cv2.circle(image, (x, y), MARK_PX - 2, BLACK, cv2.FILLED, cv2.LINE_AA)
-            cv2.circle(image, (x, y), MARK_PX // 2, inside, cv2.FILLED, cv2.LINE_AA)
-            write(image, name, (x, y - MARK_PX if name == "start" else y + 2 * MARK_PX))
-
-
-def _cells(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32]) -> Image:
-    """Return the drawn area: white where there are no points, else the darker, the more confident points a cell has."""
-    width, height = sheet.area_px
-    cell_px = int(np.ceil(sheet.px_per_m * _CELL_M))  # never finer than a voxel: no white lines in a wall
-    columns, rows = -(-width // cell_px), -(-height // cell_px)
-    cell = np.floor((xy_m - sheet.low_m) * sheet.px_per_m / cell_px)
-    drawn = ((cell >= 0) & (cell < [columns, rows])).all(axis=1)
-    column, row = cell[drawn].astype(np.int64).T
-    density = np.bincount(row * columns + column, confidence[drawn], columns * rows)
-    filled = density[density > 0]
-    median = float(np.median(filled)) if filled.size else 1.0
-    grey = np.where(density > 0, 190.0 - 190.0 * density / (density + median), 255.0).astype(np.uint8)
-    grey = grey.reshape(rows, columns).repeat(cell_px, axis=0).repeat(cell_px, axis=1)
-    return np.repeat(grey[:height, :width][::-1, :, None], 3, axis=2)
-
-
-def _draw_frame(image: Image, sheet: Sheet) -> None:
-    """Draw the border, the names of the axes and a scale bar."""
-    # The longest bar of 1, 2 or 5 times a power of ten that is not much longer than its label.
-    longest_m = 2 * MARGIN_PX / sheet.px_per_m
-    decade = 10.0 ** np.floor(np.log10(longest_m))
-    bar_m = float(decade * max(digit for digit in (1, 2, 5) if digit * decade <= longest_m))
-    (left, bottom), (right, top) = sheet.pixels(np.stack([sheet.low_m, sheet.high_m])).tolist()
-    cv2.rectangle(image, (left, top), (right, bottom), BLACK, 1)
-    write(image, "x forward", ((left + right) // 2, bottom + 2 * MARK_PX))
-    write(image, "y left", (left, top - MARK_PX))
-    bar, y = right - round(bar_m * sheet.px_per_m), MARGIN_PX - MARK_PX
-    cv2.rectangle(image, (bar, y - MARK_PX // 2), (right, y), BLACK, cv2.FILLED)
-    write(image, f"{bar_m:g} m", ((bar + right) // 2, y - MARK_PX))
-
-
-def with_legend(image: Image, lines: Sequence[tuple[str, Colour, int]]) -> Image:
-    """Return the image with a row below: for each line its name, after a sample of its colour and width [px]."""
-    gap_px, left = 28, MARGIN_PX
-    image = np.pad(image, ((0, gap_px), (0, 0), (0, 0)), constant_values=255)
-    y = image.shape[0] - gap_px
-    for name, colour, width_px in lines:
-        cv2.line(image, (left, y), (left + gap_px, y), colour, width_px, cv2.LINE_AA)
-        left += 2 * gap_px + write(image, name, (left + gap_px + MARK_PX, y + MARK_PX // 2), is_centred=False)
-    return image
-
-
-def write(image: Image, text: str, bottom: tuple[int, int], *, is_centred: bool = True) -> int:
-    """Write black text on white above a point, centred or to the right of it; return its width [px]."""
-    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.5
-    (width, height), below = cv2.getTextSize(text, font, scale, 1)
-    left, y = bottom[0] - (width // 2 if is_centred else 0), bottom[1]
-    cv2.rectangle(image, (left - 2, y - height - 1), (left + width + 2, y + below), WHITE, cv2.FILLED)
-    cv2.putText(image, text, (left, y), font, scale, BLACK, 1, cv2.LINE_AA)
-    return width
+def shares_of(axes: Axes, xy_m: Array) -> Array:
+    """Return the places (N, 2) of points (N, 2) [m] in the image, in shares of its width and, from above, height."""
+    return np.asarray(axes.transData.transform(xy_m) / axes.figure.bbox.size * (1, -1) + (0, 1))

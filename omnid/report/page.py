@@ -77,11 +77,9 @@ def grid(figures: Sequence[str]) -> str:
 
 
 @cache
-def colours() -> dict[str, tuple[int, int, int]]:
-    """Return the colours of the style sheet by their names, BGR, for images."""
-    found = re.findall("--([a-z]+):#([0-9a-f]{6})", (files("omnid.report") / "report.css").read_text("utf-8"))
-    rgb = {name: bytes.fromhex(digits) for name, digits in found}
-    return {name: (blue, green, red) for name, (red, green, blue) in rgb.items()}
+def colours() -> dict[str, str]:
+    """Return the colours of the style sheet by their names."""
+    return dict(re.findall("--([a-z]+):(#[0-9a-f]{6})", (files("omnid.report") / "report.css").read_text("utf-8")))
 
 
 @cache

@@ -8,11 +8,10 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from itertools import pairwise
 
-import cv2
 import numpy as np
 
 from calib import se3
-from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
+from omnid.formats.plan import Lines, between, draw_plan, drawn_heights, image_of, shares_of
 from omnid.formats.tum import Trajectory
 from omnid.plain_text import MOST_ENTRIES, utc
 from omnid.recordings.evaluation import associate, evaluate
@@ -109,19 +108,17 @@ def _plan(run: RecordedRun, events: Sequence[Event]) -> list[str]:
     breaks = {0, len(xy), *(np.flatnonzero(np.diff(run.ranks)) + 1).tolist()}
     for first, last in pairwise(sorted(breaks)):
         stretches.setdefault(int(run.ranks[first]), []).append(xy[max(0, first - 1) : last])
-    lines = [Lines([run.map_xy], colour["map"], 2), Lines([xy], WHITE, 9)]
-    lines += [Lines(parts, colour[_path_name(rank)], 3 + 2 * max(rank, 0)) for rank, parts in sorted(stretches.items())]
-    sheet = sheet_of(points_xy, np.vstack([xy, run.map_xy]))
-    image = draw_plan(sheet, points_xy, confidence, lines)
-    # 3. Losses, start and end.
+    lines = [Lines([run.map_xy], colour["map"], 1.5), Lines([xy], "white", 6.5)]
+    lines += [
+        Lines(parts, colour[_path_name(rank)], 2 + 1.5 * max(rank, 0)) for rank, parts in sorted(stretches.items())
+    ]
+    axes = draw_plan(points_xy, confidence, lines, xy)
+    # 3. Losses.
     lost_s = [event.start_s for event in events if (event.source, event.text) == ("state", STATES[-1])]
-    for x, y in sheet.pixels(xy[np.searchsorted(run.t_s, lost_s[:MOST_ENTRIES])]).astype(int).tolist():
-        cv2.drawMarker(image, (x, y), BLACK, cv2.MARKER_TILTED_CROSS, 16, 3)
-    draw_ends(image, sheet, xy[0], xy[-1])
+    axes.plot(*xy[np.searchsorted(run.t_s, lost_s[:MOST_ENTRIES])].T, "kx", markersize=11, markeredgewidth=2)
     # 4. The figure, with the positions of at most 1000 poses for the pointer.
     chosen = np.unique(np.linspace(0, len(xy) - 1, 1000).astype(int))
-    shares = sheet.pixels(xy[chosen]) / np.array(image.shape[1::-1])
-    places = np.column_stack([run.t_s[chosen], shares]).round(4).tolist()
+    places = np.column_stack([run.t_s[chosen], shares_of(axes, xy[chosen])]).round(4).tolist()
     named = {_path_name(rank): f"the path, {STATES[rank]}" if rank >= 0 else "the path" for rank in stretches}
     named |= {"map": "in the map"} if len(run.map_xy) else {}
     keys = [f"<span class='key'><i class='p-{name}'></i>{words}</span>" for name, words in named.items()]
@@ -132,7 +129,7 @@ def _plan(run: RecordedRun, events: Sequence[Event]) -> list[str]:
     )
     return [
         f"<figure class='plan'><figcaption><b>Path and map</b>{''.join(keys)}</figcaption><div class='sheet' "
-        f"data-plan='{json.dumps(places, separators=(',', ':'))}'>{embedded(image, 'png')}<i hidden></i></div>"
+        f"data-plan='{json.dumps(places, separators=(',', ':'))}'>{embedded(image_of(axes), 'png')}<i hidden></i></div>"
         f"<small>{footnote if len(points) else 'The log holds no map that can be drawn.'}</small></figure>"
     ]
 

@@ -16,7 +16,7 @@ from calib import se3
 from omnid.config import Config
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.errors import OmnidError
-from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, draw_ends, draw_plan, sheet_of, with_legend
+from omnid.formats.plan import Lines, draw_plan, image_of
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, simulate
 from omnid.simulation.robot import make_robot
@@ -27,11 +27,6 @@ Array = NDArray[np.float64]
 ROUTE: Final = "demo"
 DRIVE_S: Final = 90.0  # Longest drive in simulated time.
 STRAIGHT_M, RADIUS_M = 0.8, 0.7  # The oval that is taught: 6 m.
-LEGEND: Final = (  # colour (BGR) and width [px]
-    ("walls and boxes", LIGHT_GREY, 3),
-    ("taught path", BLACK, 5),
-    ("repeated path", RED, 2),
-)
 
 
 def oval() -> Array:
@@ -103,13 +98,13 @@ def demonstrate(image: Path, config: Config, seed: int, show: Callable[[str], No
         for later in (False, True)
     )
     # 2. The image: the world, and both rounds.
-    segments, no_points = world.obstacles(1.2), np.zeros((0, 2))
-    sheet = sheet_of(no_points, segments.reshape(-1, 2))
-    parts = (list(segments), [first], [second])
-    lines = [Lines(part, colour, width_px) for part, (_, colour, width_px) in zip(parts, LEGEND, strict=True)]
-    drawn = draw_plan(sheet, no_points, np.zeros(0, np.float32), lines)
-    draw_ends(drawn, sheet, first[0])
-    if not cv2.imwrite(str(image), with_legend(drawn, LEGEND)):
+    lines = [
+        Lines(list(world.obstacles(1.2)), "silver", 2, "walls and boxes"),
+        Lines([first], "black", 4, "taught path"),
+        Lines([second], "red", 1.5, "repeated path"),
+    ]
+    drawn = image_of(draw_plan(np.zeros((0, 2)), np.zeros(0, np.float32), lines, first))
+    if not cv2.imwrite(str(image), drawn):
         raise OmnidError(f"{image}: cannot be written; name another folder by --output")
     # 3. The errors.
     end = script.end or f"not reached within {DRIVE_S:g} s"
