@@ -38,7 +38,6 @@ MIN_SHARED_DEG = 15.0
 MAX_WIDTH_PX, MAX_PIXELS = 16384, 16 * 2**20
 # Guards against division by zero on the cylinder's axis.
 MIN_RADIUS = 1e-9
-# Rows of a table that are computed at once, because the projection takes some 200 bytes a pixel.
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,3 +22,8 @@ class NavigationState(StrEnum):
     def is_end(self) -> bool:
         """True if nothing is under way: the wheels are given no setpoint."""
         return self in (self.IDLE, self.REACHED, self.CANCELLED, self.FAILED)
+
+
+def with_reason(state: str, reason: str) -> str:
+    """Return a state with its reason, for people."""
+    return f"{state}: {reason}" if reason else str(state)

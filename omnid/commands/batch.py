@@ -44,9 +44,9 @@ class Job:
 
     log: Path
     folder: Path  # of the results
-    words: tuple[str, ...]  # of `omnid replay`
+    arguments: tuple[str, ...]  # of the program omnid
     truth: Path | None  # trajectory that the result is compared with
-    seen: str  # version of omnid, words, size and date of the log: what is stored is of another job where it differs
+    fingerprint: str  # version of omnid, arguments, size and date of the log: a stored result must have the same
 
 
 @command(CAMERAS, FILE_AND_SET)
@@ -93,12 +93,12 @@ def replay(job: Job) -> dict[str, Any]:
     started_s = time.monotonic()
     shutil.rmtree(job.folder, ignore_errors=True)
     job.folder.mkdir(parents=True)
-    code, summary = _omnid(job.words, job)
+    code, summary = _omnid(job.arguments, job)
     status, error = DONE.get(code, "failed"), ""
     if code not in DONE:
         lines = (job.folder / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
         error = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
-    result = {"log": str(job.log), "seen": job.seen, "status": status, "error": error, "replay": summary}
+    result = {"log": str(job.log), "fingerprint": job.fingerprint, "status": status, "error": error, "replay": summary}
     if code in DONE and job.truth is not None:
         result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
     result["seconds"] = round(time.monotonic() - started_s, 3)
@@ -106,9 +106,9 @@ def replay(job: Job) -> dict[str, Any]:
     return result
 
 
-def _omnid(words: Sequence[str], job: Job) -> tuple[int, Any]:
+def _omnid(arguments: Sequence[str], job: Job) -> tuple[int, Any]:
     """Run omnid in the folder of a job; return its exit code and the JSON that it printed."""
-    command, environment = python("-m", "omnid", *words), python_environment(**ENVIRONMENT)
+    command, environment = python("-m", "omnid", *arguments), python_environment(**ENVIRONMENT)
     with (job.folder / "messages.txt").open("ab") as messages:
         done = subprocess.run(command, cwd=job.folder, env=environment, stdout=subprocess.PIPE, stderr=messages)
     with suppress(ValueError):
@@ -124,9 +124,9 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
             "batch: each replay would extend places.map, so that results depend on their order: add "
             "--set places.localize_only=true, or make a map of all logs by `omnid map build`"
         )
-    given = [f"--{name}={path.absolute()}" for name in ("rig", "config") if (path := vars(args)[name])]
-    given += [f"--{name}={topic}" for name in ("lower", "upper") if (topic := vars(args)[name])]
-    given += [f"--set={value}" for value in args.set] + OUTPUTS
+    shared = [f"--{name}={path.absolute()}" for name in ("rig", "config") if (path := vars(args)[name])]
+    shared += [f"--{name}={topic}" for name in ("lower", "upper") if (topic := vars(args)[name])]
+    shared += [f"--set={value}" for value in args.set] + OUTPUTS
     logs = sorted({Path(os.path.abspath(log)) for path in args.logs for log in _below(path)})
     if not logs:
         raise OmnidError(f"batch: no log in {', '.join(map(str, args.logs))}")
@@ -135,9 +135,9 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
     for log in logs:
         beside = (log if log.is_dir() else log.parent) / args.truth
         truth = beside if args.truth and beside.is_file() else None
-        words = ("replay", str(log), *given, "--inline", "--quiet", "--json")
-        seen = f"omnid {__version__} {' '.join(words)} {log.stat().st_size} {log.stat().st_mtime_ns}"
-        jobs.append(Job(log, args.out.absolute() / log.relative_to(common), words, truth, seen))
+        arguments = ("replay", str(log), *shared, "--inline", "--quiet", "--json")
+        fingerprint = f"omnid {__version__} {' '.join(arguments)} {log.stat().st_size} {log.stat().st_mtime_ns}"
+        jobs.append(Job(log, args.out.absolute() / log.relative_to(common), arguments, truth, fingerprint))
     return jobs
 
 
@@ -163,7 +163,7 @@ def _stored(job: Job) -> dict[str, Any] | None:
     """Return the result of an earlier run of the same job, None without one."""
     try:
         result: dict[str, Any] = json.loads((job.folder / RESULT_FILE).read_text())
-        return result if result["seen"] == job.seen and result["status"] in DONE.values() else None
+        return result if result["fingerprint"] == job.fingerprint and result["status"] in DONE.values() else None
     except (OSError, ValueError, TypeError, KeyError):
         return None
 

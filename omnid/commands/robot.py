@@ -129,16 +129,15 @@ def teach(args: argparse.Namespace) -> int:
                 is_open, finished = bool(sys.stdin.readline()), driver.route("finish")
                 if finished.done or not is_open:
                     granted(robot, finished)
+                    outcome, code = "written", 0
                     break
                 print(finished.text, flush=True)
         except KeyboardInterrupt:
             driver.route("stop")
-            HANDLER.show("")
-            print(f"{name} is dropped")
-            return 130
+            outcome, code = "dropped", 130
     HANDLER.show("")
-    print(f"{name} is written")
-    return 0
+    print(f"{name} is {outcome}")
+    return code
 
 
 @command(NAME, ROBOT, SETTINGS)

@@ -18,6 +18,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, OdometryUpdate
+from omnid.navigation_state import with_reason
 from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer, Answers
 
@@ -52,8 +53,9 @@ def navigation_answers(update: NavigationUpdate) -> Answers | None:
     """Return the answer to the newest request to the navigation; a repeated answer has no effect."""
     if update.answer is None:
         return None
-    refusal, state = update.answer.refusal, f"{update.state}: {update.reason}" if update.reason else str(update.state)
-    return {update.answer.id: Answer(not refusal, refusal or f"accepted; navigation: {state}")}
+    refusal = update.answer.refusal
+    text = refusal or f"accepted; navigation: {with_reason(update.state, update.reason)}"
+    return {update.answer.id: Answer(not refusal, text)}
 
 
 class ReplayDrive:

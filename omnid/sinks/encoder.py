@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.voxel_map import ThinnedPath
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
+from omnid.navigation_state import NavigationState, with_reason
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
 from omnid.transport.bus import Bus
@@ -167,6 +168,12 @@ def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0, run: str = "") -
     return PoseAttachment(odometry.seq, odometry.state, *counts, sent_ns, run).to_bytes()
 
 
+SEVERITIES: Final = {
+    NavigationState.FAILED: "_error",
+    **dict.fromkeys((NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED), "_warning"),
+}
+
+
 def navigation_stats(update: NavigationUpdate) -> Stats:
     """Return the numbers of an update, for its own topic: see NavigationReport."""
     names = ("state", "task", "reason", "left_m", "offset_m")
@@ -174,6 +181,7 @@ def navigation_stats(update: NavigationUpdate) -> Stats:
     stats |= {
         "command_ns": update.command_ns or "",
         "loops_left": update.loops_left if update.loops_left > 1 else "",
+        SEVERITIES.get(update.state, "_ok"): with_reason(update.state, update.reason),
     }
     if update.teaching:
         stats |= {"teaching": update.teaching, "taught_m": update.taught_m}

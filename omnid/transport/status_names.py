@@ -20,7 +20,7 @@ import msgspec
 from omnid.core.control.safety_rules import ASKED
 from omnid.engine.graph import Histogram
 from omnid.errors import OmnidError
-from omnid.navigation_state import NavigationState
+from omnid.navigation_state import with_reason
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, decode_diagnostics
 
@@ -102,21 +102,8 @@ TICK_LATE: Final = "tick_late"
 Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys, and words
 LEVELS: Final = {"_error": ERROR, "_stale": STALE, "_warning": WARN, "_ok": OK}  # of a message by its key
 
-HINDERED: Final = (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED)
-
-
-def state_and_reason(stats: Stats) -> str:
-    """Return a state in words."""
-    return f"{stats['state']}: {stats['reason']}" if stats["reason"] else str(stats["state"])
-
-
 # What the numbers of a part mean: the first message that is not empty, and its severity.
 MESSAGES: Final[Mapping[str, Mapping[int, Callable[[Stats], object]]]] = {
-    NAVIGATION: {
-        ERROR: lambda stats: stats["state"] == NavigationState.FAILED and state_and_reason(stats),
-        WARN: lambda stats: stats["state"] in HINDERED and state_and_reason(stats),
-        OK: state_and_reason,
-    },
     BUS: {
         ERROR: lambda stats: stats["same_name"] and SAME_NAME,
         OK: lambda _: "open",
@@ -228,7 +215,7 @@ class NavigationReport:
     @property
     def words(self) -> str:
         """The state with the reason."""
-        return f"{self.state}: {self.reason}" if self.reason else self.state
+        return with_reason(self.state, self.reason)
 
 
 def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:

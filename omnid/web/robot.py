@@ -58,9 +58,9 @@ class RobotPage:
             "arm": self.arm,
             "drive": self.drive,
             "goal": self.goal,
-            "route": partial(self._asked_in_words, "route", route_request, Driver.route),
-            "navigation": partial(self._asked_in_words, "navigation", navigation_verb, Driver.navigate),
-            "map": lambda _: self._asked("map", Driver.save_map),
+            "route": partial(self._ask_by_text, "route", route_request, Driver.route),
+            "navigation": partial(self._ask_by_text, "navigation", navigation_verb, Driver.navigate),
+            "map": lambda _: self._ask("map", Driver.save_map),
         }
         return [
             Route("/live", self.feed.live),
@@ -91,8 +91,8 @@ class RobotPage:
             try:
                 stopping = partial(stop, self.feed.bus, connection=self.feed.robot)
                 is_stopped = await asyncio.get_running_loop().run_in_executor(self._stop_thread, stopping)
-                words = "the robot stops: its wheels stay stopped until it is armed" if is_stopped else not_confirmed
-                answer = Answer(is_stopped, words)
+                text = "the robot stops: its wheels stay stopped until it is armed" if is_stopped else not_confirmed
+                answer = Answer(is_stopped, text)
             except OmnidError as error:
                 answer = Answer(False, f"{not_confirmed}. {error}")
         return answer
@@ -104,7 +104,7 @@ class RobotPage:
         stamp_ms = stamp_of(await text_of(request))
         if stamp_ms < self._stop_ms:
             return Answer(False, "a stop was asked for since: arm again if it is to move")
-        return await self._asked("arm", Driver.arm)
+        return await self._ask("arm", Driver.arm)
 
     async def goal(self, request: Request) -> Answer:
         """Pass on a goal in odom, "X Y STAMP" or "X Y YAW STAMP" in m, m, deg; without YAW with any heading."""
@@ -113,19 +113,19 @@ class RobotPage:
             raise OmnidError('a goal is "X Y STAMP" or "X Y YAW STAMP" in m, m, deg')
         stamp_of(found[4])
         heading_rad = None if found[3] is None else math.radians(float(found[3]))
-        return await self._asked("goal", lambda driver: driver.goal(float(found[1]), float(found[2]), heading_rad))
+        return await self._ask("goal", lambda driver: driver.goal(float(found[1]), float(found[2]), heading_rad))
 
-    async def _asked_in_words(
+    async def _ask_by_text(
         self, kind: str, parse: Callable[[str], NavigationRequest], ask: Callable[[Driver, str], Answer], asked: Request
     ) -> Answer:
-        """Pass on a request in the words of cmd/route or cmd/navigation, such as "repeat NAME stamp=STAMP"."""
+        """Pass on a request by the text of cmd/route or cmd/navigation, such as "repeat NAME stamp=STAMP"."""
         found = _STAMPED.fullmatch(await text_of(asked))
         text, stamp = ("", None) if found is None else found.groups()
         if may_begin_motion(parse(text)):
             stamp_of(stamp or "")
-        return await self._asked(kind, lambda driver: ask(driver, text))
+        return await self._ask(kind, lambda driver: ask(driver, text))
 
-    async def _asked(self, kind: str, ask: Callable[[Driver], Answer]) -> Answer:
+    async def _ask(self, kind: str, ask: Callable[[Driver], Answer]) -> Answer:
         """Ask the robot in a thread; refuse where another request of this kind still waits for its answer."""
         robot = self._robot()
         if kind in self._busy:

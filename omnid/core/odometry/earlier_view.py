@@ -66,7 +66,7 @@ def contradicted(
     of_world, of_rig = (
         (now * normalised_patches(earlier.lower, at, 2 * HALF_PX + 1)[0]).sum(axis=1) for at in (there, here)
     )
-    has_moved = np.hypot(lower.apart(there[:, 0] - here[:, 0]), there[:, 1] - here[:, 1]) > HALF_PX
+    has_moved = np.hypot(lower.wrap(there[:, 0] - here[:, 0]), there[:, 1] - here[:, 1]) > HALF_PX
     wrong = np.zeros(len(points), bool)
     wrong[chosen] = (of_world < LEAST) | (has_moved & (of_rig > of_world))
     return wrong

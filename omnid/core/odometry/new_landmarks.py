@@ -62,7 +62,7 @@ def located(
     #    the slopes of its surface.
     guessed = np.flatnonzero(np.isfinite(guess).all(axis=1))
     there, good = track(*pair, points[guessed], guess[guessed], klt)
-    good &= np.abs(frame.lower.apart(there[:, 0] - guess[guessed, 0])) < CROSS_PX + spread_px[guessed]
+    good &= np.abs(frame.lower.wrap(there[:, 0] - guess[guessed, 0])) < CROSS_PX + spread_px[guessed]
     good &= there[:, 1] > points[guessed, 1]
     near[guessed[good]] = there[good]
     slopes = disparity_slopes(dense, points, near[:, 1] - points[:, 1])
@@ -85,7 +85,7 @@ def _has_wrong_period(pair: Pair, pixels: Array, rows: Array, known: Array, most
     if not len(known):
         repeated = _repeats(pair, pixels, own, np.ones((len(pixels), most_px + 1), bool), REACH_PX)
         return np.asarray(repeated & (repeated.mean() > 1 - LEAST_UNIQUE_SHARE))
-    away = pair[0].apart(pixels[:, :1] - known[:, 0]) ** 2 + (pixels[:, 1:] - known[:, 1]) ** 2
+    away = pair[0].wrap(pixels[:, :1] - known[:, 0]) ** 2 + (pixels[:, 1:] - known[:, 1]) ** 2
     nearest = np.argpartition(away, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
     around = np.median((known[:, 2] - known[:, 1])[nearest], axis=1)
     differs = (own > OTHER_RATIO * around) | (around > OTHER_RATIO * own)

@@ -45,7 +45,7 @@ def track(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt
     there, found = flow(a, b, points, guess, klt)
     back, returned = flow(b, a, there, points, klt)
     error = back - points
-    error[:, 0] = a.apart(error[:, 0])
+    error[:, 0] = a.wrap(error[:, 0])
     close = (error**2).sum(axis=1) < klt.max_error_px**2
     return there, found & returned & close
 

@@ -163,7 +163,7 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
     there, is_tracked = track(lower, upper, points, guess, KLT)
     # 3. Keep those that stay near the coarse place and lie lower in the upper panorama than in the lower one.
     step = there - guess
-    step[:, 0] = lower.apart(step[:, 0])
+    step[:, 0] = lower.wrap(step[:, 0])
     good &= is_tracked & (np.abs(step).max(axis=1) < 2 * COARSE) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
     below, above = points[good], there[good]
     if exposure is not None:

@@ -70,7 +70,7 @@ class PaddedPanorama:
             return own, np.asarray((own >= 0) & (own <= self.width - 1))
         return self.own(own), np.ones(len(own), bool)
 
-    def apart(self, columns: Array) -> Array:
+    def wrap(self, columns: Array) -> Array:
         """Return differences (N,) of columns, the short way around a full turn."""
         return np.asarray((columns + self.period_px / 2) % self.period_px - self.period_px / 2)
 

@@ -24,7 +24,7 @@ def test_a_full_turn_wraps_around() -> None:
     assert TURN.padded(COLUMNS).tolist() == [105.0, 8.0, 107.5, 11.0]
     own, known = TURN.unpadded(np.array([0.0, 8.0, 115.0]))
     assert own.tolist() == [92.0, 0.0, 7.0] and known.all()
-    assert TURN.apart(np.array([99.0, -51.0, 10.0])).tolist() == [-1.0, 49.0, 10.0]
+    assert TURN.wrap(np.array([99.0, -51.0, 10.0])).tolist() == [-1.0, 49.0, 10.0]
 
 
 def test_a_sector_has_two_ends_and_a_place_in_the_turn() -> None:
@@ -33,4 +33,4 @@ def test_a_sector_has_two_ends_and_a_place_in_the_turn() -> None:
     own, known = SECTOR.unpadded(np.array([0.0, 8.0, 107.0, 115.0]))
     assert own.tolist() == [-8.0, 0.0, 99.0, 107.0] and known.tolist() == [False, True, True, False]
     assert SECTOR.in_turn(np.array([0.0, 70.0])).tolist() == [300.0, 10.0]
-    assert SECTOR.apart(np.array([359.0])).tolist() == [-1.0]
+    assert SECTOR.wrap(np.array([359.0])).tolist() == [-1.0]
