@@ -82,7 +82,7 @@ class RigCovariance:
 MIN_BASELINE_M = 1e-3  # Viewpoints that are closer would show no depth.
 MAX_LENGTH_M = 10.0  # of baseline and height of cameras on a robot: a larger number has another unit
 # A T_base_rig that puts the cameras on the floor states no height; the identity, used without a measurement, does so.
-LEAST_HEIGHT_M = 0.1
+MIN_HEIGHT_M = 0.1
 # Larger numbers are refused: they are probably in ms and us.
 MAX_UPPER_DELAY_S, MAX_LINE_TIME_S = 1.0, 1e-3
 
@@ -160,13 +160,13 @@ class Rig:
         floor_m: height of the floor in the base frame.
         """
         height_m = float((se3.R_of(self.T_base_rig) @ self.lower.viewpoint + se3.t_of(self.T_base_rig))[2]) - floor_m
-        return height_m if height_m >= LEAST_HEIGHT_M else None
+        return height_m if height_m >= MIN_HEIGHT_M else None
 
     def at_height(self, height_m: float) -> Rig:
         """Return the rig with its lower viewpoint at a height above the base's origin."""
-        if not LEAST_HEIGHT_M <= height_m <= MAX_LENGTH_M:
+        if not MIN_HEIGHT_M <= height_m <= MAX_LENGTH_M:
             raise CalibError(
-                f"height of the cameras: expected {LEAST_HEIGHT_M:g} to {MAX_LENGTH_M:g} m from the floor "
+                f"height of the cameras: expected {MIN_HEIGHT_M:g} to {MAX_LENGTH_M:g} m from the floor "
                 f"to the lower viewpoint, found {height_m:g}"
             )
         T_base_rig = self.T_base_rig.copy()

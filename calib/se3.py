@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 # Smaller angles are computed as this one: their terms differ by less than the rounding of what they are added to.
-LEAST_ANGLE_RAD: Final = 1e-9
+MIN_ANGLE_RAD: Final = 1e-9
 
 
 def transform(R: ArrayLike, t: ArrayLike) -> Array:
@@ -169,10 +169,10 @@ def _rotation_vector(rows: Any) -> tuple[Any, Any, Any]:
 
 
 def _angle(x: Any, y: Any, z: Any) -> tuple[Any, Any]:
-    """Return the length of a vector by its components, LEAST_ANGLE_RAD at least, and the module for such numbers."""
+    """Return the length of a vector by its components, MIN_ANGLE_RAD at least, and the module for such numbers."""
     if isinstance(x, float):
-        return max(math.hypot(x, y, z), LEAST_ANGLE_RAD), math
-    return np.maximum(np.sqrt(x * x + y * y + z * z), LEAST_ANGLE_RAD), np
+        return max(math.hypot(x, y, z), MIN_ANGLE_RAD), math
+    return np.maximum(np.sqrt(x * x + y * y + z * z), MIN_ANGLE_RAD), np
 
 
 def _cross(v: tuple[Any, Any, Any], w: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:

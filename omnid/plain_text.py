@@ -9,17 +9,17 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Final
 
-MOST_CHARACTERS: Final = 400
-MOST_ENTRIES: Final = 64  # of parts in a status, and of values in a part
+MAX_CHARACTERS: Final = 400
+MAX_ENTRIES: Final = 64  # of parts in a status, and of values in a part
 
 
-def plain(text: str, most: int = MOST_CHARACTERS) -> str:
+def plain(text: str, most: int = MAX_CHARACTERS) -> str:
     """Return a text of printable characters, of which there are `most` at most."""
     shown = text[:most]
     return shown if shown.isprintable() else "".join(map(_escaped, shown))[:most]
 
 
-def one_line(message: object, most: int = MOST_CHARACTERS) -> str:
+def one_line(message: object, most: int = MAX_CHARACTERS) -> str:
     """Return a message in one line of printable characters; white space of any length becomes one blank."""
     return plain(" ".join(str(message).split()), most)
 

@@ -49,7 +49,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-MOST_PAIRS: Final = 12  # whose floors are compared
+MAX_PAIRS: Final = 12  # whose floors are compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ def calibrate_height(
     config = Config()
     front_end = FrontEnd(geometry(with_masks(log, rig, cameras), config.panorama), config)
     view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]
-    chosen = pairs[:: -(-len(pairs) // MOST_PAIRS)]
+    chosen = pairs[:: -(-len(pairs) // MAX_PAIRS)]
     depths = (front_end.dense.points(front_end.dewarp.process(pair)) for pair in chosen)
     floor = common_floor((se3.apply(rig.T_base_rig, one.points) - view, one.variance_m2) for one in depths)
     if floor is None:
@@ -101,15 +101,15 @@ def on_floor(rig: Rig, floor: Floor) -> Rig:
 
 
 HEADINGS: Final = 16  # of a full turn, 22 degrees apart, so that their textures have nothing in common
-LEAST_HEADINGS: Final = 12  # because after fewer headings more of a cluttered place seems to be fixed
+MIN_HEADINGS: Final = 12  # because after fewer headings more of a cluttered place seems to be fixed
 # Least ratio of the mean and its standard error, because in a drive through clutter (872) 0.02 % of the pixels are
 # above it after 12 headings, and borders of a lens have 10 to 60.
-LEAST_RATIO: Final = 6.0
+MIN_RATIO: Final = 6.0
 # The band-pass shows the border of a part, so that what is between two of them belongs to it.
 BETWEEN: Final = np.ones((AROUND_ROWS, 9), np.uint8)
 # Shares of the panorama that may be fixed, because less is noise, and where more is images do not follow the heading.
-LEAST, MOST = 0.01, 0.3
-LEAST_FALL: Final = math.tan(math.radians(20))  # below the horizon, because floor there is within 2.5 m of a base
+MIN_FIXED_SHARE, MAX_FIXED_SHARE = 0.01, 0.3
+MIN_FALL: Final = math.tan(math.radians(20))  # below the horizon, because floor there is within 2.5 m of a base
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,10 +146,10 @@ def calibrate_mask(
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:
                 parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
             front_end.complete()
-    if parts.headings < LEAST_HEADINGS:
+    if parts.headings < MIN_HEADINGS:
         raise OmnidError(
             f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn, "
-            f"{LEAST_HEADINGS} are needed: record a log in which it turns once on the spot"
+            f"{MIN_HEADINGS} are needed: record a log in which it turns once on the spot"
         )
     pixels = parts.pixels()
     # 2. The same in the images.
@@ -179,7 +179,7 @@ class FixedParts:
         self._shape = cylinder.height, cylinder.width
         rows = max(1, round(cylinder.height * FOCAL_PX / cylinder.focal_px))
         self._size = max(1, DIRECTIONS * cylinder.width // cylinder.turn_px), rows
-        self._first_row = round((cylinder.row0 + LEAST_FALL * cylinder.focal_px) * rows / cylinder.height)
+        self._first_row = round((cylinder.row0 + MIN_FALL * cylinder.focal_px) * rows / cylinder.height)
         self._views: dict[int, Floats] = {}  # (2, rows, columns) of the lower and the upper panorama, by heading
         self._heading = -1  # of the pair before
 
@@ -204,11 +204,11 @@ class FixedParts:
         views = np.stack(list(self._views.values()))
         # Textures are in units of their noise, of which a black lens shows less.
         mean, variance = views.mean(axis=0), np.maximum(views.var(axis=0, ddof=1), 1.0)
-        found = (mean * mean * len(views) > LEAST_RATIO**2 * variance).any(axis=0).view(np.uint8)
+        found = (mean * mean * len(views) > MIN_RATIO**2 * variance).any(axis=0).view(np.uint8)
         found[: max(0, self._first_row)] = 0
         whole = cv2.morphologyEx(found, cv2.MORPH_CLOSE, BETWEEN)
         pixels = np.asarray(cv2.resize(whole, self._shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
-        return pixels if LEAST <= pixels.mean() <= MOST else np.zeros(self._shape, bool)
+        return pixels if MIN_FIXED_SHARE <= pixels.mean() <= MAX_FIXED_SHARE else np.zeros(self._shape, bool)
 
 
 def _texture(panorama: PaddedPanorama, shown: Floats) -> Floats:

@@ -79,7 +79,7 @@ def read_rig_pairs(log: Path, rig: Rig, cameras: LogCameras) -> list[FramePair]:
     if not found:
         raise OmnidError(
             "calibrate drive: no pair of images in the log; "
-            f"{decode.fault or 'expected nearly equal stamps of both cameras'}"
+            f"{decode.first_error or 'expected nearly equal stamps of both cameras'}"
         )
     return found
 

@@ -29,7 +29,7 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.process import STOP_SIGNALS, prepare, start_thread
 
 THREAD_NAME: Final = "controller"
-MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
+MAX_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
 ABORTING: Final = signal.SIGABRT  # systemd ends a daemon that does not respond by this, and all its processes
 
 
@@ -75,7 +75,7 @@ def run_until_end(channel: Channel, controller: Controller) -> None:
 def receive_until_due(channel: Channel, controller: Controller) -> bool:
     """Pass on all messages until the tick is due, and those that wait then; False if the daemon sends no more."""
     overdue = 0
-    while overdue < MOST_OVERDUE:
+    while overdue < MAX_OVERDUE:
         left_s = (controller.due_ns - time.monotonic_ns()) * S_PER_NS
         overdue += left_s <= 0
         try:

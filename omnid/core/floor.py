@@ -38,17 +38,17 @@ STEEP: Final = math.tan(math.radians(15))
 LARGEST_SIGMA_M: Final = 0.1  # Noisier points are left out: their weight is below a 400th of that of the best.
 UNEVEN_M: Final = 0.005  # Standard deviation of an uneven floor.
 NOISE_SCALES: Final = (0.25, 1.0)  # limits of the factor on the stated noise; measured on floors: 0.3 to 0.9
-MOST_POINTS: Final = 2000  # of a pair: more would cost time and change nothing
+MAX_POINTS: Final = 2000  # of a pair: more would cost time and change nothing
 # Of the 36 floors of test_floor.py, 2000 iterations move 34 by 3 mm at most, and reject 2.
 ITERATIONS: Final = 40
 CONVERGED: Final = 1e-5  # m, rad: a step below a 300th of RIG_SIGMAS ends the search
 # Points of one surface that count as one; fitted on rendered logs, whose pairs scatter by 6 mm and 0.3 degrees.
 CORRELATED_POINTS: Final = 20.0
-LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor: odds of 150 to 1.
-LEAST_OF_PAIR: Final = 0.5  # a pair with less shows no floor
+MIN_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor: odds of 150 to 1.
+MIN_PAIR_EVIDENCE: Final = 0.5  # a pair with less shows no floor
 # Sectors of ten degrees. The floor must be seen in a third of them, because fewer determine its tilt badly.
 SECTORS: Final = 36
-LEAST_SECTORS: Final = 12
+MIN_SECTORS: Final = 12
 # Errors [m, rad, rad] of the rig and of stereo, which many pairs do not average out; measured: -12 to +8 mm.
 RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])
 # Pairs whose heights scatter by more show no common floor; those of one floor scatter by 6 mm.
@@ -129,7 +129,7 @@ def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
     evidence = float(np.log((part * on + (1 - part) * off) / off)[near].sum()) / CORRELATED_POINTS
     x, y = seen.xyz[share > 0.5, :2].T
     sectors = len(np.unique(np.floor(np.arctan2(y, x) * (SECTORS / (2 * math.pi)))))
-    if evidence < LEAST_OF_PAIR or sectors < LEAST_SECTORS or q[0] < HEIGHTS_M[0]:
+    if evidence < MIN_PAIR_EVIDENCE or sectors < MIN_SECTORS or q[0] < HEIGHTS_M[0]:
         return None
     sigma = np.hypot(np.sqrt(np.diag(np.linalg.inv(information))), RIG_SIGMAS)
     return FloorFit(Floor(float(q[0]), float(q[1]), float(q[2]), float(sigma[0]), float(sigma[1:].max())), evidence)
@@ -150,7 +150,7 @@ def common_floor(pairs: Iterable[tuple[Array, Array]]) -> Floor | None:
     Errors of pairs are not independent: their number makes the sigma no smaller than that of one pair.
     """
     found = [fit for points, variance_m2 in pairs if (fit := fit_floor(points, variance_m2)) is not None]
-    if sum(fit.evidence for fit in found) <= LEAST_EVIDENCE:
+    if sum(fit.evidence for fit in found) <= MIN_EVIDENCE:
         return None
     fits = np.array([fit.floor for fit in found])
     middle = np.median(fits, axis=0)
@@ -162,11 +162,11 @@ def common_floor(pairs: Iterable[tuple[Array, Array]]) -> Floor | None:
 
 
 def _usable(points: Array, variance_m2: Array) -> _Points:
-    """Return the points below the horizon whose noise is small enough, at most MOST_POINTS."""
+    """Return the points below the horizon whose noise is small enough, at most MAX_POINTS."""
     across, fall = np.hypot(points[:, 0], points[:, 1]), -points[:, 2]
     steep = (fall > HEIGHTS_M[0]) & (fall > STEEP * across)
     xyz, fall, across = points[steep], fall[steep], across[steep]
     sigma = np.hypot(np.sqrt(variance_m2[steep]) * fall / np.hypot(across, fall), UNEVEN_M)
     kept = np.flatnonzero(sigma < LARGEST_SIGMA_M)  # False for NaN
-    kept = kept[:: max(1, -(-len(kept) // MOST_POINTS))]
+    kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
     return _Points(xyz[kept], sigma[kept])

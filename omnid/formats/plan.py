@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig import LEAST_HEIGHT_M
+from calib.rig import MIN_HEIGHT_M
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.tum import POSITION_LIMIT_M
 
@@ -39,10 +39,10 @@ class Lines:
 def drawn_heights(height_m: float) -> tuple[float, float]:
     """Return the lowest and the highest z [m] relative to the lower viewpoint that a plan shows: those above the floor.
 
-    height_m: of the viewpoint above the floor; less than LEAST_HEIGHT_M, as 0, where the rig does not state it.
+    height_m: of the viewpoint above the floor; less than MIN_HEIGHT_M, as 0, where the rig does not state it.
     Lower surfaces are the floor: obstacles begin at 0.06 m (obstacles.scan.heights_m), and a voxel has 0.05 m.
     """
-    return max(-1.0, 0.1 - height_m if height_m >= LEAST_HEIGHT_M else -1.0), 1.5
+    return max(-1.0, 0.1 - height_m if height_m >= MIN_HEIGHT_M else -1.0), 1.5
 
 
 def plan_view(

@@ -20,7 +20,7 @@ from omnid.client import ANSWER_S, HERE, NavigationReport, Robot
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
-from omnid.plain_text import MOST_ENTRIES, plain
+from omnid.plain_text import MAX_ENTRIES, plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
 from omnid.transport.session import PERIOD_S, BusConfig
 from omnid.transport.status_names import DISARMED_BY_STOP, SIMULATION, STAGE_PREFIX, TIMEOUT_S, WHEELS, Key, short_name
@@ -101,7 +101,7 @@ class RobotState:
     def add_diagnostics(self, diagnostics: Diagnostics) -> None:
         """Keep the newest status of each part of the robot."""
         for status in diagnostics.statuses if self.alive is not False else ():
-            if status.name in self.statuses or len(self.statuses) < MOST_ENTRIES:
+            if status.name in self.statuses or len(self.statuses) < MAX_ENTRIES:
                 self.statuses[status.name] = status
 
     def _add_pose(self, pose: Pose, arrival_s: float) -> None:

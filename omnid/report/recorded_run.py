@@ -16,7 +16,7 @@ import numpy as np
 from calib.errors import CalibError
 from calib.rig_file import parse_rig
 from omnid.formats.tum import POSITION_LIMIT_M
-from omnid.plain_text import MOST_ENTRIES
+from omnid.plain_text import MAX_ENTRIES
 from omnid.recordings.recording import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
 from omnid.report.page import Array, Curve
 from omnid.tracking_state import TrackingState
@@ -96,7 +96,7 @@ class RecordedRun:
                     map_xy.append(in_map.T_map_base[:2, -1])
                 case Diagnostics(stamp_ns, statuses):
                     for status in statuses:
-                        if status.name in entries or len(entries) < MOST_ENTRIES:
+                        if status.name in entries or len(entries) < MAX_ENTRIES:
                             entries.setdefault(status.name, []).append((stamp_ns, status))
                 case Cloud():
                     self.cloud = message.content
@@ -131,7 +131,7 @@ class RecordedRun:
         self.newest: dict[str, DiagnosticStatus] = {}
         for name, found in self.by_name.items():
             values = {key: value for _, status in found for key, value in status.values.items()}
-            self.newest[name] = replace(found[-1][1], values=dict([*values.items()][:MOST_ENTRIES]))
+            self.newest[name] = replace(found[-1][1], values=dict([*values.items()][:MAX_ENTRIES]))
         # 5. The state of each pose, and resets. An entry with `state` has the stamp of the first pose in it; others
         #    have the state of an earlier pose.
         of_odometry = self.by_name.get(status_names.ODOMETRY, [])

@@ -13,7 +13,7 @@ import numpy as np
 from calib import se3
 from omnid.formats.plan import Lines, between, draw_plan, drawn_heights, image_of, shares_of
 from omnid.formats.tum import Trajectory
-from omnid.plain_text import MOST_ENTRIES, utc
+from omnid.plain_text import MAX_ENTRIES, utc
 from omnid.recordings.evaluation import associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.page import Array, Curve, chart, colours, embedded, facts, grid, note, page, style_and_script, table
@@ -115,7 +115,7 @@ def _plan(run: RecordedRun, events: Sequence[Event]) -> list[str]:
     axes = draw_plan(points_xy, confidence, lines, xy)
     # 3. Losses.
     lost_s = [event.start_s for event in events if (event.source, event.text) == ("state", STATES[-1])]
-    axes.plot(*xy[np.searchsorted(run.t_s, lost_s[:MOST_ENTRIES])].T, "kx", markersize=11, markeredgewidth=2)
+    axes.plot(*xy[np.searchsorted(run.t_s, lost_s[:MAX_ENTRIES])].T, "kx", markersize=11, markeredgewidth=2)
     # 4. The figure, with the positions of at most 1000 poses for the pointer.
     chosen = np.unique(np.linspace(0, len(xy) - 1, 1000).astype(int))
     places = np.column_stack([run.t_s[chosen], shares_of(axes, xy[chosen])]).round(4).tolist()
@@ -144,12 +144,12 @@ def _events_table(events: Sequence[Event]) -> list[str]:
     if not events:
         return ["<p>No events: no change of state, no gap, no loss.</p>"]
     rows = []
-    for event in events[:MOST_ENTRIES]:
+    for event in events[:MAX_ENTRIES]:
         start, end = (_time(at_s) for at_s in (event.start_s, event.end_s))
         text = f"{event.text} ({event.count})" if event.count else event.text
         times = start if start == end else f"{start} to {end}"
         rows.append((times, LEVELS[event.level], escape(event.source), escape(text)))
-    more = [note(f"and {len(events) - MOST_ENTRIES} more")] if len(events) > MOST_ENTRIES else []
+    more = [note(f"and {len(events) - MAX_ENTRIES} more")] if len(events) > MAX_ENTRIES else []
     return ["<div class='events'>", table(("time", "", "part", "event (count)"), rows), "</div>", *more]
 
 

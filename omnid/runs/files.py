@@ -25,7 +25,7 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, PlaceUpdate
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
-from omnid.transport.topics import MOST_OPEN, Answer, Answers
+from omnid.transport.topics import MAX_OPEN, Answer, Answers
 
 
 class RunPlaces:
@@ -70,7 +70,7 @@ class RunPlaces:
         self.is_new = not self._loaded_ids
         # 2. Saves, and requests for them.
         self.written: Path | None = None
-        self._request_ids: deque[int] = deque(maxlen=MOST_OPEN)  # to be answered by the next write
+        self._request_ids: deque[int] = deque(maxlen=MAX_OPEN)  # to be answered by the next write
         self._is_requested = False  # since the newest copy
         self._save_ns, self._copied_ns = round(settings.save_s * NS_PER_S), 0
         self._saved = frozenset[int]()  # keyframes in the file

@@ -208,7 +208,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
         if is_subscribed.pop(topics.WHEEL_ODOM):
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
-        navigation = graph.inlet(topics.MOST_OPEN), states
+        navigation = graph.inlet(topics.MAX_OPEN), states
     inputs = Inputs(frames, run_places, controller, navigation, reports, config.live.cloud_s)
     places = wire(config, inputs, front_end, graph, outputs)
 

@@ -40,7 +40,7 @@ from omnid.stages.obstacles import Obstacles
 from omnid.transport import status_names
 from omnid.transport.bus import Bus
 from omnid.transport.codec import Diagnostics
-from omnid.transport.topics import MOST_OPEN, Answers
+from omnid.transport.topics import MAX_OPEN, Answers
 
 BUS_S: Final = 3.0  # Time until a bus must be closed.
 CLOUD_POINTS: Final = 50_000  # Most points of the map in one message.
@@ -253,7 +253,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         ("bus-status", inputs.reports, BUS),
     ]
     if outputs.answers is not None:
-        graph.sink("answer", outputs.answers, *answers, thread=BUS, depth=MOST_OPEN)
+        graph.sink("answer", outputs.answers, *answers, thread=BUS, depth=MAX_OPEN)
     if outputs.recorder is not None:
         images: Sequence[Stream[Any]] = ()
         if inputs.reports is not None:

@@ -36,7 +36,7 @@ from omnid.sinks.drive import NAVIGATION_SENDER, controller_pose
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.obstacles import controller_scan
-from omnid.transport.topics import MOST_OPEN
+from omnid.transport.topics import MAX_OPEN
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ def simulate(
     # 2. The stages of the daemon, which work while frames and samples are yielded, and what they give the robot.
     graph = Graph(threaded=False)
     front_end = FrontEnd(geometry(rig, config.panorama), config)
-    requests, states = graph.inlet(MOST_OPEN), graph.inlet(1)
+    requests, states = graph.inlet(MAX_OPEN), graph.inlet(1)
     newest = deque[OdometryUpdate](maxlen=1)
 
     def messages() -> Iterator[Frame | MotionSample]:

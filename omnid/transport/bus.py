@@ -32,7 +32,7 @@ from omnid.transport.topics import (
     ARM,
     CLOCK,
     COMMANDS,
-    MOST_OPEN,
+    MAX_OPEN,
     PUBLISHED,
     STOP,
     Answer,
@@ -149,7 +149,7 @@ class Bus:
         self._rings: list[Ring] = []  # of commands; those of requests to arm and of stops are the last ones
         self._ids = count(1)
         self._open: dict[int, zenoh.Query] = {}  # requests that wait for their answers, by id
-        self._answered: deque[tuple[zenoh.Query, Answer]] = deque(maxlen=MOST_OPEN)
+        self._answered: deque[tuple[zenoh.Query, Answer]] = deque(maxlen=MAX_OPEN)
         self._stop_listener: StopListener | None = None
         self._pollers = [Poller(self._answer_queries, PERIOD_S, "bus queries")]
 
@@ -312,7 +312,7 @@ class Bus:
         sender, sent_ns, echo_ns = ros2.read_attachment(message.attachment.to_bytes() if message.attachment else b"")
         if isinstance(message, zenoh.Query):
             self._open[id] = message
-            if len(self._open) > MOST_OPEN:  # the oldest one is dropped
+            if len(self._open) > MAX_OPEN:  # the oldest one is dropped
                 self._open.pop(min(self._open.copy()), None)
         elif message.source_info is not None:
             sender = str(message.source_info.source_id.zid)

@@ -27,7 +27,7 @@ from rosbags.typesys.store import Typestore
 from calib import se3
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.errors import OmnidError
-from omnid.plain_text import MOST_ENTRIES, plain
+from omnid.plain_text import MAX_ENTRIES, plain
 
 if TYPE_CHECKING:
     from omnid.core.obstacles.moving_tracker import MovingObstacle
@@ -308,7 +308,7 @@ def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
             plain(entry.name),
             int(entry.level),
             plain(entry.message),
-            {plain(pair.key): plain(pair.value) for pair in entry.values[:MOST_ENTRIES]},
+            {plain(pair.key): plain(pair.value) for pair in entry.values[:MAX_ENTRIES]},
         )
         for entry in message.status
     )

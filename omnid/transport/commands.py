@@ -41,7 +41,7 @@ from omnid.transport import codec, topics
 from omnid.transport.sensor_codec import LARGEST_VALUE
 from omnid.transport.topics import Answer, Request
 
-LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
+MIN_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
 _CLOCKS: Final = (
     "synchronise the clocks, or stamp with the robot's own time: omnid.client attaches it, another program may repeat "
     "the stamp of the newest odom; controller.deadlines.command_s is the longest age"
@@ -260,7 +260,7 @@ def _twist_command(payload: bytes) -> tuple[int, Setpoint]:
     stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = codec.twist_from_cdr(payload)
     _check(frame, "base_link", velocity_mps, yaw_rate_radps)
     for name, speed in aside.items():
-        if not abs(speed) <= LEAST_SPEED:
+        if not abs(speed) <= MIN_SPEED:
             found = f"twist.{name} = {speed:g}; send linear.x and angular.z only"
             raise Refused("not possible with a differential drive", found)
     return stamp_ns, Setpoint(velocity_mps, None, yaw_rate_radps)

@@ -22,7 +22,7 @@ from omnid.transport.session import BusConfig, needs_proof
 ASKED: Final = "asked"  # the daemon has passed the stop on
 STOPPED: Final = "stopped"  # the robot is disarmed by a stop
 REPEAT_S: Final = 0.05
-MOST_PER_PASS: Final = 16  # Most datagrams that one pass reads of a socket during a flood.
+MAX_PER_PASS: Final = 16  # Most datagrams that one pass reads of a socket during a flood.
 _HEAD: Final = b"omnid stop 1 "
 _REQUEST: Final = re.compile(rb"omnid stop 1 ([0-9a-f]{16}) ([!-~]{1,256}) *")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls|ws)/(.+):(\d{1,5})(?:[?#].*)?")  # those whose UDP port is free
@@ -54,7 +54,7 @@ class StopListener:
         """Take the requests that have come, a bounded number, or wait for one."""
         self._poll.poll(1000 * REPEAT_S)
         for listener in self._sockets:
-            for _ in range(MOST_PER_PASS):
+            for _ in range(MAX_PER_PASS):
                 with suppress(OSError):  # there is no more, or an earlier answer could not be delivered
                     data, sender = listener.recvfrom(self._longest)
                     found = _REQUEST.fullmatch(data)
@@ -88,7 +88,7 @@ class StopSender:
             time.sleep(min(REPEAT_S, max(0.0, deadline_s - time.monotonic())))
             for sender in self._sockets:
                 with suppress(OSError):  # there is no more, or no program listens there
-                    for _ in range(MOST_PER_PASS):
+                    for _ in range(MAX_PER_PASS):
                         answer = self._answers.get(sender.recv(len(self._request)), answer)
             if time.monotonic() >= deadline_s:
                 break

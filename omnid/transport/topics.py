@@ -122,7 +122,7 @@ def plain_key(robot: str, topic: str) -> str:
     return f"{robot}/{topic.removeprefix('/')}"
 
 
-MOST_OPEN: Final = 64  # requests that wait for their answers; each holds a message in memory
+MAX_OPEN: Final = 64  # requests that wait for their answers; each holds a message in memory
 
 
 class Request(NamedTuple):

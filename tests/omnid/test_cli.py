@@ -13,7 +13,7 @@ import pytest
 
 from omnid.cli import COMMANDS, command_at, main, parser_of
 from omnid.config import Config
-from omnid.plain_text import MOST_CHARACTERS, one_line, plain
+from omnid.plain_text import MAX_CHARACTERS, one_line, plain
 from omnid.settings import value_at
 from tests.omnid.commands.test_batch import short_log
 
@@ -120,7 +120,7 @@ def test_what_is_not_printable_is_escaped(text: str, shown: str) -> None:
 
 def test_a_message_is_one_line_of_limited_length() -> None:
     assert one_line(ValueError(" two\r\nlines \x07 ")) == r"two lines \x07"
-    assert len(plain("\0" * 1000)) == len(one_line("x" * 1000)) == MOST_CHARACTERS and plain("abc", 2) == "ab"
+    assert len(plain("\0" * 1000)) == len(one_line("x" * 1000)) == MAX_CHARACTERS and plain("abc", 2) == "ab"
 
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from omnid.core.places.pose_graph import PoseEdges, optimise
 
 Array = NDArray[np.float64]
 
-LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
+MIN_COVARIANCE: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
 KEYFRAMES_PER_LOOP: Final = 50  # one loop that fits waits per this number of keyframes; by trial on development seeds
 RECENT: Final = 8  # Newest loops, because they show the present drift; a refused loop may be accepted while among them.
 # Share of the squared distances that the drift explains, because the others may be wrong loops, and that quantile of
@@ -72,7 +72,7 @@ class MapCorrection:
         joined = {id for link in links for id in (link.a, link.b)}
         part = [id for id in part if id not in fixed or id in joined]
         row = {id: n for n, id in enumerate(part)}
-        by_odometry = [self.factor * link.covariance + LEAST_ODOMETRY for link in links]
+        by_odometry = [self.factor * link.covariance + MIN_COVARIANCE for link in links]
         edges = PoseEdges(
             np.array([(row[link.a], row[link.b]) for link in links]),
             np.array([link.T_a_b for link in links]),
@@ -122,7 +122,7 @@ class MapCorrection:
         for (a, b), loops in same.items():
             odometry = Link.by_odometry(self._places.keyframes[a], self._places.keyframes[b])
             errors.append(np.mean([se3.log(se3.inverse(loop.T_a_b) @ odometry.T_a_b) for loop in loops], axis=0))
-            by_odometry.append(odometry.covariance + LEAST_ODOMETRY)
+            by_odometry.append(odometry.covariance + MIN_COVARIANCE)
             by_loop.append(np.mean([loop.covariance for loop in loops], axis=0))
         # 3. The drift of the whole path, or of its newest part where that is larger: the rig may have been bent.
         return max(

@@ -21,7 +21,7 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought.
-LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene; below half of it corners are noise
+MIN_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene; below half of it corners are noise
 # Brightness of one panorama by the other's, above which nothing is changed: at 0.88 poses are as exact as at 1, at 0.85
 # they were degraded, at 0.8 lost.
 SAME_BRIGHTNESS = 0.87
@@ -49,12 +49,12 @@ class Light:
     @property
     def is_too_dark(self) -> bool:
         """True if a dim image has more noise than contrast: poses are then not to be relied on."""
-        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < LEAST_CONTRAST_TO_NOISE
+        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < MIN_CONTRAST_TO_NOISE
 
     @property
     def shows_nothing(self) -> bool:
         """True if the corners of a dim image are noise, so that a map of them would be wrong."""
-        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < LEAST_CONTRAST_TO_NOISE / 2
+        return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < MIN_CONTRAST_TO_NOISE / 2
 
 
 def light(sums: TileSums, noise_grey: float) -> Light:
