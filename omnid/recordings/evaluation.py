@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from calib import se3
 from omnid.errors import OmnidError
@@ -108,10 +109,9 @@ def body_rotation(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 
     truth: trajectory of the body. The worlds are aligned by all positions; the rotation is the mean over the poses.
     """
     (R, xyz), (true_R, true_xyz) = map(parts, same_times(estimate, truth, tolerance_s))
-    R_odom_truth, _ = rotation_between(true_xyz - true_xyz.mean(axis=0), xyz - xyz.mean(axis=0))
-    columns = np.swapaxes(R.swapaxes(1, 2) @ R_odom_truth @ true_R, 1, 2).reshape(-1, 3)
-    R_rig_body, _ = rotation_between(np.tile(np.eye(3), (len(R), 1)), columns)
-    return se3.transform(R_rig_body, np.zeros(3))
+    odom_truth, _ = Rotation.align_vectors(xyz - xyz.mean(axis=0), true_xyz - true_xyz.mean(axis=0))
+    rig_body = Rotation.from_matrix(R.swapaxes(1, 2) @ odom_truth.as_matrix() @ true_R).mean()
+    return se3.transform(rig_body.as_matrix(), np.zeros(3))
 
 
 def associate(
@@ -140,15 +140,6 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def rotation_between(a: Array, b: Array) -> tuple[Array, Array]:
-    """Return the rotation R (3, 3) with b = R a for vectors (N, 3), by least squares (Kabsch).
-
-    The second result (3,) holds the singular values of the covariance of both, the largest first.
-    """
-    U, spread, Vt = np.linalg.svd(b.T @ a)
-    return np.asarray(U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt), spread
-
-
 def aligned(T_est: Array, T_true: Array, alignment: str) -> Array:
     """Return the estimates (N, 4, 4) in the world of the truth, row by row at the same times.
 
@@ -159,10 +150,10 @@ def aligned(T_est: Array, T_true: Array, alignment: str) -> Array:
         return np.asarray(T_true[0] @ se3.inverse(T_est[0]) @ T_est)
     (est_R, est_xyz), (_, true_xyz) = parts(T_est), parts(T_true)
     from_middle = est_xyz - est_xyz.mean(axis=0)
-    R, spread = rotation_between(from_middle, true_xyz - true_xyz.mean(axis=0))
-    # The second extent of the path, as a fraction of the first, is below one per mille.
-    if len(T_true) <= 2 or spread[1] <= 1e-6 * spread[0]:
+    extents = np.linalg.svd(from_middle, compute_uv=False)
+    if extents[1] <= 1e-3 * extents[0]:
         raise OmnidError(
             f"--align {alignment}: the associated positions lie on a line and determine no rotation; use --align origin"
         )
+    R = Rotation.align_vectors(true_xyz - true_xyz.mean(axis=0), from_middle)[0].as_matrix()
     return se3.transform(R @ est_R, from_middle @ R.T + true_xyz.mean(axis=0))
