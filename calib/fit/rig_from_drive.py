@@ -10,7 +10,6 @@ Poses and the rig are common unknowns of the least-squares problem; each landmar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -98,18 +97,16 @@ def adjust_drive(
     parameters: RigParameters,
     state: DriveState,
     observations: DriveObservations,
-    fixed: Sequence[int] = (0,),
     *,
     correlated: float = 1.0,
 ) -> DriveAdjustment:
     """Return the rig, poses and landmarks of least robust reprojection error near those given.
 
-    fixed: keyframes whose pose stays, one for each drive. correlated: number of observations that count as one
-    independent one; the weight of the prior of the parameters is multiplied by it.
-    CalibError where fewer landmarks agree than the rig has parameters.
+    correlated: number of observations that count as one independent one; the weight of the prior of the parameters is
+    multiplied by it. CalibError where fewer landmarks agree than the rig has parameters.
     """
     prior = parameters.prior()
-    problem = DriveProblem(parameters, observations, correlated * prior, np.asarray(fixed))
+    problem = DriveProblem(parameters, observations, correlated * prior)
     state, sigma_px = problem.minimised(state, ROUGH_GAIN)
     # Loose landmarks are left out in several rounds, because the rig moves without them, and others become loose.
     for number in range(ROUNDS):
@@ -131,10 +128,9 @@ def adjust_drive(
     return DriveAdjustment(parameters, state, observations, covariance, sigma_px)
 
 
-def observation_sigma(rig: Rig, found: DriveAdjustment, fixed: Sequence[int] = (0,)) -> float:
+def observation_sigma(rig: Rig, found: DriveAdjustment) -> float:
     """Return the sigma [px] of one coordinate with another rig, which stays; poses and landmarks are adjusted."""
-    none = RigParameters(rig, ())
-    problem = DriveProblem(none, found.observations, np.zeros((0, 0)), np.asarray(fixed))
+    problem = DriveProblem(RigParameters(rig, ()), found.observations, np.zeros((0, 0)))
     return problem.minimised(replace(found.state, steps=np.zeros(0)), ROUGH_GAIN)[1]
 
 
@@ -153,12 +149,14 @@ Jacobians: TypeAlias = tuple[Array, scipy.sparse.csr_matrix, Array, Array]
 
 @dataclass(frozen=True, slots=True)
 class DriveProblem:
-    """The robust reprojection error of landmarks, and the prior of the rig: what an adjustment of a drive minimises."""
+    """The robust reprojection error of landmarks, and the prior of the rig: what an adjustment of a drive minimises.
+
+    The pose of the first keyframe stays.
+    """
 
     parameters: RigParameters
     observations: DriveObservations
     prior: Array  # (P, P) information of the steps, about zero
-    fixed: Indices  # keyframes whose pose stays
 
     def minimised(self, state: DriveState, gain: float) -> tuple[DriveState, float]:
         """Return the state of least cost, and the standard deviation [px] of one coordinate there."""
@@ -208,8 +206,7 @@ class DriveProblem:
         """Return the state after steps of poses and rig (C,) and of landmarks (L, 3); None without such a camera."""
         of_poses, of_rig = np.split(common, [len(common) - len(self.prior)])
         T = state.T_rig_odom.copy()
-        free = np.setdiff1d(np.arange(len(T)), self.fixed)
-        T[free] = se3.exp(of_poses.reshape(-1, 6)) @ T[free]
+        T[1:] = se3.exp(of_poses.reshape(-1, 6)) @ T[1:]
         moved = replace(state, T_rig_odom=T, points=state.points + blocks, steps=state.steps + of_rig)
         try:
             self.parameters.at(moved.steps)
@@ -264,9 +261,8 @@ class DriveProblem:
         by_pose = np.concatenate([by_rig_point, -by_rig_point @ se3.hat(in_rig)], axis=2)
         by_steps = (self._by_steps(state) * root[:, :, None]).reshape(residual.size, len(self.prior))
         J_poses = _scattered(by_pose, seen.keyframe, len(state.T_rig_odom))
-        is_free = np.repeat(~np.isin(np.arange(len(state.T_rig_odom)), self.fixed), 6)
         of_landmarks = by_rig_point @ se3.R_of(state.T_rig_odom[seen.keyframe])
-        return (residual * root).ravel(), J_poses[:, is_free], by_steps, of_landmarks
+        return (residual * root).ravel(), J_poses[:, 6:], by_steps, of_landmarks
 
     def _by_point(self, steps: Array, points: Array) -> Array:
         """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""

@@ -1,9 +1,8 @@
-"""Self-calibration from drives: odometry with the rig as it is, landmarks, bundle adjustment; and once more."""
+"""Self-calibration from a drive: odometry with the rig as it is, landmarks, bundle adjustment; and once more."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -27,7 +26,7 @@ from calib.rig_file import read_rig
 from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import Progress
-from omnid.calibration.drive_observations import Drives, collect
+from omnid.calibration.drive_observations import collect
 from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.rig.rig_health import SIGMAS
@@ -41,17 +40,16 @@ DISTORTION = ("p1", "p2")
 
 @dataclass(frozen=True, slots=True)
 class DriveCalibration:
-    """The rig that fits the drives."""
+    """The rig that fits the drive."""
 
     rig: Rig  # with its covariance
     adjustment: DriveAdjustment
     first_sigma_px: float  # of an observation with the rig as it was
-    drives: Drives
 
     def __str__(self) -> str:
         uncertainty, adjustment = drive_uncertainty(self.rig), self.adjustment
         return (
-            f"{self.drives.keyframes} keyframes, {len(adjustment.state.points)} landmarks, "
+            f"{len(adjustment.state.T_rig_odom)} keyframes, {len(adjustment.state.points)} landmarks, "
             f"{len(adjustment.observations)} observations; error {self.first_sigma_px:.3f} px before, "
             f"{adjustment.sigma_px:.3f} px after" + (f"; drives: {uncertainty}" if uncertainty else "")
         )
@@ -65,45 +63,42 @@ class DriveCalibration:
 
 
 def calibrate_drive(
-    logs: Sequence[str | PathLike[str]],
+    log: str | PathLike[str],
     rig: str | PathLike[str] | Rig,
     topics: AnyCameras = (None, None),
     progress: Progress = silent,
 ) -> DriveCalibration:
-    """Return the rig that fits drives best, near the one given; OmnidError or CalibError where they do not suffice.
+    """Return the rig that fits a drive best, near the one given; OmnidError or CalibError where it does not suffice.
 
-    logs: one name of a file, or several. topics: of the lower and the upper camera. progress receives one line for each
-    round.
+    topics: of the lower and the upper camera. progress receives one line for each round.
     """
-    paths = [Path(log) for log in ([logs] if isinstance(logs, str) else logs)]
-    rig, config = rig if isinstance(rig, Rig) else read_rig(Path(rig)), Config()
+    log, rig, config = Path(log), rig if isinstance(rig, Rig) else read_rig(Path(rig)), Config()
     # 1. Find the rims of the mirrors, and start with tangential terms and times of exposure. Wavefronts are parameters
     #    if boards have shown them: a drive alone shows them as well, but the central cameras that remain measured the
     #    lengths of other drives less well.
     cameras = LogCameras(*topics)
-    before = with_masks(paths[0], rig, cameras)
+    before = with_masks(log, rig, cameras)
     waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
     parameters = RigParameters.about(before, DISTORTION, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
-    steps = straightened(paths[0], parameters, cameras, config, progress)
+    steps = straightened(log, parameters, cameras, config, progress)
     require_same_rig(parameters, steps)
     # 3. Track and adjust: each round tracks in panoramas of the rig of the one before, the first one in those of a rig
     #    that is hardly known.
     correlated = 1.0 if before.covariance is None else CORRELATED_OBSERVATIONS
     for number in range(1 + ROUNDS):
-        drives = collect(paths, parameters.at(steps), cameras, config)
-        tracked = replace(drives.state, steps=steps)
-        found = adjust_drive(parameters, tracked, drives.observations, drives.fixed, correlated=correlated)
+        state, observations = collect(log, parameters.at(steps), cameras, config)
+        found = adjust_drive(parameters, replace(state, steps=steps), observations, correlated=correlated)
         steps = found.state.steps
         progress(
-            f"round {number + 1}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
+            f"round {number + 1}: {len(observations)} observations from {len(state.T_rig_odom)} keyframes, error "
             f"{found.sigma_px:.3f} px"
         )
     # 4. Refuse what is another rig.
     require_same_rig(parameters, steps)
     # 5. The length of the baseline by the prior, and the covariance.
-    first_sigma_px = observation_sigma(before, found, drives.fixed)
-    return DriveCalibration(_finished_rig(before, found), found, first_sigma_px, drives)
+    first_sigma_px = observation_sigma(before, found)
+    return DriveCalibration(_finished_rig(before, found), found, first_sigma_px)
 
 
 def straightened(

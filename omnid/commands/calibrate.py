@@ -163,15 +163,15 @@ def live(args: argparse.Namespace) -> int:
 
 @options.command(options.LOG_CAMERAS, options.HEIGHT)
 def drive(args: argparse.Namespace) -> int:
-    """Adjust all parameters of a rig to drives with turns, without a board.
+    """Adjust all parameters of a rig to a drive with turns, without a board.
 
-    Then find the height of the cameras, if the rig states none, and what is fixed to them, where the first log shows
-    it. Exit code 1: the rig has drifted (--only check), or nothing was found that could be written.
+    Then find the height of the cameras, if the rig states none, and what is fixed to them, where the log shows it. Exit
+    code 1: the rig has drifted (--only check), or nothing was found that could be written.
 
-    logs LOG...        drives with turns; 100 to 350 pairs
+    log LOG            a drive with turns; 100 to 350 pairs
     --rig FILE         the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images,
-        baseline by ruler; default: the one attached to the first log
-    --only check|height|mask...  only this, by the first log; may be repeated. check: compare the rig with the images;
+        baseline by ruler; default: the one attached to the log
+    --only check|height|mask...  only this; may be repeated. check: compare the rig with the images;
         height: height and tilt of the cameras by the floor; mask: hide what is fixed to the cameras, by a log in which
         the robot turns once
     -o, --output FILE  the rig.toml to write; may be the file of --rig
@@ -183,30 +183,30 @@ def drive(args: argparse.Namespace) -> int:
     """
     # 1. The rig to start from.
     if args.output is not None:
-        check_outputs([("--output", args.output)], [("the log that is read", log) for log in args.logs])
+        check_outputs([("--output", args.output)], [("the log that is read", args.log)])
     if args.rig is not None:
         start = read_rig(args.rig)
     else:
-        with closing(LogReader(args.logs[0], log_cameras(args))) as reader:
-            start = attached_rig(reader, args.logs[0])
+        with closing(LogReader(args.log, log_cameras(args))) as reader:
+            start = attached_rig(reader, args.log)
     prepare_kernels()
     # 2. Check the rig, or adjust all of it.
     rig, has_drifted, topics = start, False, log_cameras(args)
     if "check" in args.only:
-        checked = check_log(args.logs[0], rig, topics)
+        checked = check_log(args.log, rig, topics)
         print(checked)
         has_drifted = checked.finding.state is not RigState.FITS
     elif not args.only:
-        adjusted = calibrate_drive(args.logs, rig, topics, lambda line: print(line, file=sys.stderr))
+        adjusted = calibrate_drive(args.log, rig, topics, lambda line: print(line, file=sys.stderr))
         print(adjusted)
         if not adjusted.is_better:
-            print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
+            print(f"{args.rig or 'the attached rig'} fits this drive as well as any rig")
         rig = adjusted.rig if adjusted.is_better else rig
     # 3. Find the height, and the masks; a log that shows none of them is no error but for --only.
     rig = _at_height(args, rig)
     if not args.only or "mask" in args.only:
         try:
-            mask = calibrate_mask(args.logs[0], rig, topics)
+            mask = calibrate_mask(args.log, rig, topics)
             print(mask)
             rig = mask.rig if mask.share or args.only else rig
         except OmnidError as error:
@@ -234,7 +234,7 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> Rig:
     if not is_wanted and (args.only or rig.height_m() is not None):
         return rig
     try:
-        found = calibrate_height(args.logs[0], rig, log_cameras(args))
+        found = calibrate_height(args.log, rig, log_cameras(args))
     except OmnidError as error:
         if is_wanted:
             raise

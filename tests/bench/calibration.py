@@ -149,7 +149,7 @@ def chain(
         if drives:
             render_drive(ROOM, seed, amount, room)
             begin_s = time.monotonic()
-            again = omnid.calibrate_drive([room / "log.mcap"], found["boards"][0]).rig
+            again = omnid.calibrate_drive(room / "log.mcap", found["boards"][0]).rig
             found["boards, then a drive"] = again, time.monotonic() - begin_s
         for name, (rig, spent_s) in found.items():
             sigma, errors = drive_uncertainty(rig), drive(log, in_true_frame(rig, truth))

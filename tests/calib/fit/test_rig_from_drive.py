@@ -113,7 +113,7 @@ def test_landmarks_that_move_are_left_out(truth: Rig) -> None:
 def problem_points(truth: Rig, state: DriveState, observations: DriveObservations) -> Array:
     """Return the landmark of each observation in the rig frame."""
     parameters = RigParameters.about(truth)
-    problem = DriveProblem(parameters, observations, parameters.prior(), np.zeros(1, int))
+    problem = DriveProblem(parameters, observations, parameters.prior())
     return problem.in_rig(replace(state, steps=np.zeros(15)), np.zeros(15))
 
 

@@ -216,7 +216,7 @@ def test_a_rig_that_fits_as_well_as_any_is_kept(
     out = tmp_path / "out.toml"
     assert calibrate(scene / "log.mcap", "--rig", tmp_path / "high.toml", "-o", out) == 1
     printed = capsys.readouterr().out
-    assert "fits these drives as well as any rig" in printed and printed.endswith("nothing was written\n")
+    assert "fits this drive as well as any rig" in printed and printed.endswith("nothing was written\n")
     assert "of 16 headings of a turn" in printed and not out.exists()
     assert calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", out, "--height-m", "0.9") == 0
     assert read_rig(out).height_m() == pytest.approx(0.9)
