@@ -22,7 +22,7 @@ WAVEFRONT_NAMES = ("w_a", "w_b", "w_x", "w_y", "w_s")
 TERMS = len(WAVEFRONT_NAMES)
 # Iterations of the direction, because each reduces its error by the offset as a fraction of the distance, 1 / 1000.
 STEPS = 4
-# Least 1 + z, at which directions opposite to the axis are held: guards against division by zero.
+# Least value of 1 + z, for directions opposite to the axis: guards against division by zero.
 MIN_DENOMINATOR = 0.05
 
 

@@ -7,7 +7,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ from omnid.engine.graph import Histogram, StageStats
 from omnid.engine.logging_setup import HANDLER
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import OdometryUpdate
+from omnid.navigation_state import with_reason
 from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
@@ -92,7 +92,7 @@ def pair_loss(pairing: Synchronise, read: Mapping[str, int]) -> str:
     """
     if read["broken_records"]:
         return "images may be missing: see what was lost"
-    possible, made = round(pairing.possible + read["broken"] / len(CAMERAS)), pairing.counts["pairs"]
+    possible, made = round(pairing.possible + read["broken"] / len(CAMERAS)), pairing.stats()["pairs"]
     lost = possible - made
     return f"{lost} of {possible} pairs are missing: see what was lost" if lost > NOTABLE_SHARE * possible else ""
 
@@ -140,7 +140,7 @@ def show_progress(statistics: RunStatistics, expected: int | None, ended: bool) 
 
 def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
     """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
-    stats: dict[str, Any] = pairing.stats()
+    stats = pairing.stats()
     poses, states, dark = statistics.poses, statistics.states, statistics.dark_pairs
     lost, degraded, notable = states[TrackingState.LOST], states[TrackingState.DEGRADED], NOTABLE_SHARE * poses
     unpaired = min(stats["unpaired_lower"], stats["unpaired_upper"])
@@ -244,14 +244,14 @@ class StatusCollector:
             Key.RESETS: newest.reset_counter,
             "length_m": self._statistics.length_m,
             **times(status_names.CAPTURE_TO_POSE, self._statistics.latency),
-            **({"_stale": "no new pose"} if age_s > TIMEOUT_S else {severity: f"{state}: {fault}" if fault else state}),
+            **({"_stale": "no new pose"} if age_s > TIMEOUT_S else {severity: with_reason(state, fault)}),
         }
 
     def _pairing(self) -> Stats:
         pair, images = self._pair, self._stages["pair"]
-        stats: dict[str, Any] = pair.stats()
+        stats = pair.stats()
         missing = [name for name, stamp_ns in pair.newest_ns.items() if not self._age_s(stamp_ns) <= TIMEOUT_S]
-        pairs_hz, broken_hz = (self._rate_hz(name, pair.counts[name]) for name in ("pairs", "broken"))
+        pairs_hz, broken_hz = (self._rate_hz(name, stats[name]) for name in ("pairs", "broken"))
         processed_hz, dropped_hz = (
             self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
         )

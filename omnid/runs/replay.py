@@ -230,7 +230,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         begun_s = time.monotonic()
         with graph.signals():
             run_to_end(graph, run_places)
-        found, read, paired = session.statistics, reader.counts, front_end.pairing.counts
+        found, read, paired = session.statistics, reader.counts, front_end.pairing.stats()
         # Losses by reason, zeros too.
         drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
         drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}

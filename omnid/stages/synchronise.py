@@ -6,7 +6,7 @@ import math
 from collections import deque
 from itertools import product
 from statistics import median_low
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,18 +193,14 @@ class Synchronise:
         """Stamp of each camera's newest frame; 0 before the first."""
         return {name: camera.newest_ns for name, camera in self._cameras.items()}
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Pairs made, frames without a partner, images that could not be decoded, images that repeat earlier ones."""
-        unpaired = {f"unpaired_{name}": camera.unpaired for name, camera in self._cameras.items()}
-        repeated = {f"repeated_{name}": camera.repeated for name, camera in self._cameras.items()}
-        return {"pairs": self._pairs, **unpaired, "broken": self._decode.broken, **repeated}
-
-    def stats(self) -> dict[str, object]:
+    def stats(self) -> dict[str, Any]:
         """Return the numbers of the pairing, for the status and for warnings at the end of a run."""
         cameras = self._cameras.items()
         return {
-            **self.counts,
+            "pairs": self._pairs,
+            **{f"unpaired_{name}": one.unpaired for name, one in cameras},  # frames without a partner
+            "broken": self._decode.broken,  # images that could not be decoded
+            **{f"repeated_{name}": one.repeated for name, one in cameras},  # images that repeat those before
             "skew_ms": self.skew.median_ns * 1e-6,
             "exposure_skew_ms": self.skew.exposure_ns * 1e-6,
             "tolerance_ms": self._tolerance_ns * 1e-6,  # largest difference between the stamps of a pair

@@ -176,7 +176,7 @@ def render_grey(
 
 
 def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Array) -> Floats:
-    """Return what the ray caster knows of rectangles (R, 4, 4), in the camera frame; see ray_caster_kernels.
+    """Return the rows (R, 4, 4) of rectangles for the compiled loops, in the camera frame; see ray_caster_kernels.
 
     nearest_m (R,): least distance of each from the origin of any ray.
     """
@@ -192,11 +192,11 @@ def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Ar
     return rows.astype(np.float32)
 
 
-def tiles_that_see(table: RayTable, corners: Array, aside_rad: Array) -> NDArray[np.bool_]:
+def tiles_that_see(table: RayTable, corners: Array, parallax_rad: Array) -> NDArray[np.bool_]:
     """Return the mask (M, R) of tiles that may see rectangles with corners (R, 4, 3) in the camera frame.
 
     A tile sees none of what lies between the sides of the pyramid from the origin through a rectangle if its whole cone
-    is beyond one of them. aside_rad (R,): largest angle between a ray and the direction from the camera's origin of
+    is beyond one of them. parallax_rad (R,): largest angle between a ray and the direction from the camera's origin of
     what it meets.
     """
     # 1. The normals (R, 4, 3) of the sides, to the inside; 0 where an edge leads to the origin.
@@ -205,7 +205,7 @@ def tiles_that_see(table: RayTable, corners: Array, aside_rad: Array) -> NDArray
     normals *= (inwards[:, None] / np.maximum(np.linalg.norm(normals, axis=2), MIN_DISTANCE_M**2))[:, :, None]
     # 2. The least sine, of all four, of the angle from a side to the tile's axis.
     sines = np.min([table.axes @ normals[:, side].T for side in range(4)], axis=0)
-    reach_rad = np.minimum(table.angles[:, None] + aside_rad, np.pi / 2)
+    reach_rad = np.minimum(table.angles[:, None] + parallax_rad, np.pi / 2)
     return np.asarray(sines >= -np.sin(reach_rad))
 
 

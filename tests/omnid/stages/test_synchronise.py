@@ -50,7 +50,7 @@ def made(pair: Synchronise, *frames: Frame) -> list[FramePair]:
 
 
 def unpaired(pair: Synchronise) -> tuple[int, int]:
-    return pair.counts["unpaired_lower"], pair.counts["unpaired_upper"]
+    return pair.stats()["unpaired_lower"], pair.stats()["unpaired_upper"]
 
 
 def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:
@@ -93,7 +93,7 @@ def test_pairs_again_after_a_camera_was_away(pair: Synchronise) -> None:
     back = [frame for index in range(1000, 1010) for frame in (shot("lower", index), shot("upper", index))]
     assert len(made(pair, *back)) == 10
     pair.finish()
-    assert unpaired(pair) == (0, 999) and pair.counts["pairs"] == 11
+    assert unpaired(pair) == (0, 999) and pair.stats()["pairs"] == 11
 
 
 @pytest.mark.parametrize("broken", [("lower",), ("lower", "upper")])
@@ -102,7 +102,7 @@ def test_a_broken_image_is_treated_as_if_it_had_never_come(pair: Synchronise, br
     data = {camera: JPEG[:100] if camera in broken else JPEG for camera in ("lower", "upper")}
     early = [shot("lower", 0), shot("lower", 0, 2 * MS, data["lower"])]
     found = made(pair, *early, shot("upper", 0, 3 * MS, data["upper"]), shot("upper", 0, 4 * MS))
-    assert len(found) == 1 and pair.counts["broken"] == len(broken)
+    assert len(found) == 1 and pair.stats()["broken"] == len(broken)
     assert found[0].stamp_ns == shot("lower", 0, 0 if "lower" in broken else 2 * MS).stamp_ns
 
 
@@ -161,15 +161,10 @@ def test_pairs_of_a_frozen_camera_are_left_out(rig: Rig, dead: tuple[Camera, ...
     assert pairing.stats()["_frozen"] == " and the ".join(dead)
     made = [pair for frame in [*shots[40:]] if (pair := pairing.process(frame)) is not None]
     assert [pair is not None for pair in during[1::2]] == [True] * 10 + [False] * 10 and len(made) == 10
-    assert pairing.counts == {
-        "pairs": 20,
-        "unpaired_lower": 0,
-        "unpaired_upper": 0,
-        "broken": 0,
-        "repeated_lower": 10 * ("lower" in dead),
-        "repeated_upper": 10 * ("upper" in dead),
-    }
-    assert [pair.seq for pair in made] == list(range(10, 20)) and not pairing.stats()["_frozen"]
+    stats = pairing.stats()
+    assert stats["pairs"] == 20 and unpaired(pairing) == (0, 0) and not stats["broken"] and not stats["_frozen"]
+    assert all(stats[f"repeated_{camera}"] == 10 * (camera in dead) for camera in ("lower", "upper"))
+    assert [pair.seq for pair in made] == list(range(10, 20))
 
 
 TRIGGERED = random.Random(1)
