@@ -149,7 +149,7 @@ class ObstacleScan:
     T_odom_base: Array  # (4, 4)
     moving: tuple[MovingObstacle, ...] = ()
     # (360,) the images show nothing to rely on there: a part of them is frozen, dark, saturated or blurred
-    unwatched: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(360, bool))
+    unobserved: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(360, bool))
     grid: FloorGrid | None = None  # the cells around the base; None: the floor or the pose is unknown, or none in view
 
 

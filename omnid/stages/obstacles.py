@@ -104,8 +104,8 @@ class Obstacles:
         panoramas = odometry.depth.panoramas
         T_odom_base = frames.of_base(odometry, self._geometry.rig.T_base_rig)[0]
         tiles, cylinder = panoramas.tiles, self._geometry.cylinder
-        unwatched = sectors_of(tiles.unknown, cylinder, self._T_base_rect, self._ranges_m)
-        unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
+        unobserved = sectors_of(tiles.unknown, cylinder, self._T_base_rect, self._ranges_m)
+        unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unobserved)
         # 2. Tables of the floor.
         if is_lost or self._T_floor_rig is None:
             return unknown
@@ -126,9 +126,9 @@ class Obstacles:
         # 5. Directions in which the images show nothing to rely on are unknown.
         return replace(
             unknown,
-            ranges_m=np.where(unwatched, UNKNOWN, scan.ranges_m),
-            sigma_m=np.where(unwatched, UNKNOWN, scan.sigma_m),
-            free_m=np.where(unwatched, NOT_FREE, scan.free_m),
+            ranges_m=np.where(unobserved, UNKNOWN, scan.ranges_m),
+            sigma_m=np.where(unobserved, UNKNOWN, scan.sigma_m),
+            free_m=np.where(unobserved, NOT_FREE, scan.free_m),
             moving=moving,
             grid=scan.grid,
         )
@@ -149,5 +149,5 @@ def controller_scan(scan: ObstacleScan) -> ControllerScan:
         tuple(np.maximum(nearest, 0.0).tolist()),
         tuple(scan.free_m.tolist()),
         tuple(moving),
-        tuple(scan.unwatched.tolist()) if scan.unwatched.any() else (),
+        tuple(scan.unobserved.tolist()) if scan.unobserved.any() else (),
     )

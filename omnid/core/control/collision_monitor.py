@@ -74,7 +74,7 @@ class ControllerScan(NamedTuple):
     ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
     free_m: tuple[float, ...] = ()  # (N,) up to which a direction was seen to be free; empty: the range, 0 if unknown
     moving: tuple[MovingPoint, ...] = ()
-    unwatched: tuple[bool, ...] = ()  # (N,) the images show nothing to rely on there; empty: they do everywhere
+    unobserved: tuple[bool, ...] = ()  # (N,) True: the images show nothing to rely on there; empty: nowhere
 
 
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
@@ -217,7 +217,7 @@ BLOCKED: Final = "an obstacle is in the way"
 NEAR: Final = "an obstacle is near"
 MOVING: Final = "a moving obstacle comes into the way"
 UNKNOWN: Final = "the way ahead is unknown"
-UNWATCHED: Final = "the images of the way ahead are frozen, dark or dirty"
+UNOBSERVED: Final = "the images of the way ahead are frozen, dark or dirty"
 UNSEEN: Final = "the images show nothing: they are frozen, dark or dirty"
 SCAN_STALE: Final = "no new obstacle scan"
 IMAGES_REMEDY: Final = "check light, mirrors, cameras and load, which the status names"
@@ -225,7 +225,7 @@ IMAGES_REMEDY: Final = "check light, mirrors, cameras and load, which the status
 
 def remedy(reason: str) -> str:
     """Return what to do about a reason to slow down or stop."""
-    return IMAGES_REMEDY if reason in (SCAN_STALE, UNWATCHED, UNSEEN) else "drive back or turn away, or clear the way"
+    return IMAGES_REMEDY if reason in (SCAN_STALE, UNOBSERVED, UNSEEN) else "drive back or turn away, or clear the way"
 
 
 class Allowance(NamedTuple):
@@ -275,21 +275,21 @@ class CollisionMonitor:
             return
         self._stamp_ns, self._moving = scan.stamp_ns, scan.moving
         settings, count = self._settings, len(scan.ranges_m)
-        unwatched = scan.unwatched if len(scan.unwatched) == count else (False,) * count
-        self._is_blind = all(unwatched)
+        unobserved = scan.unobserved if len(scan.unobserved) == count else (False,) * count
+        self._is_blind = all(unobserved)
         azimuths = ((k + 0.5) * (math.tau / count) - math.pi for k in range(count))
         directions = [(math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths]
         seen = [(r * c, r * s) for r, (c, s) in zip(scan.ranges_m, directions, strict=True) if math.isfinite(r)]
-        ends: dict[str, list[Point]] = {"unwatched": [], "gap": [], "end": []}
+        ends: dict[str, list[Point]] = {"unobserved": [], "gap": [], "end": []}
         for k, free_m, is_gap in unknown_ends(scan.ranges_m, scan.free_m, settings.stop_m):
             c, s = directions[k]
-            begins_m = self._around.edge_m(c, s) if unwatched[k] else max(free_m, self._outline.edge_m(c, s))
-            ends["unwatched" if unwatched[k] else "gap" if is_gap else "end"].append((begins_m * c, begins_m * s))
+            begins_m = self._around.edge_m(c, s) if unobserved[k] else max(free_m, self._outline.edge_m(c, s))
+            ends["unobserved" if unobserved[k] else "gap" if is_gap else "end"].append((begins_m * c, begins_m * s))
         self._kinds = (
             Kind(BLOCKED, STOP, seen, is_known=True),
             Kind(UNKNOWN, settings.unknown, ends["end"]),
             Kind(UNKNOWN, settings.unknown, ends["gap"], is_gap=True),
-            Kind(UNWATCHED, STOP, ends["unwatched"]),
+            Kind(UNOBSERVED, STOP, ends["unobserved"]),
         )
 
     def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:
@@ -380,7 +380,7 @@ class CollisionMonitor:
         if speed_mps > 0.0:
             if kind.is_gap:
                 points = [(x, y) for x, y in points if side * x > edge_m]
-        elif kind.reason == UNWATCHED:
+        elif kind.reason == UNOBSERVED:
             return FREE
         else:
             # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it

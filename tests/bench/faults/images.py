@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.frame import Camera, Frame
 from omnid.config import load_config
-from omnid.core.control.collision_monitor import SCAN_STALE, UNSEEN, UNWATCHED
+from omnid.core.control.collision_monitor import SCAN_STALE, UNOBSERVED, UNSEEN
 from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.robot import make_robot
 from tests.bench.obstacles import ahead
@@ -187,7 +187,7 @@ def run(name: str, seed: int, overrides: tuple[str, ...] = ()) -> Outcome:
 def named(moment: Moment) -> str:
     """Return how the daemon names the fault now; empty: it does not. That an obstacle is near names no fault."""
     odometry, state = moment.odometry, moment.controller
-    if state.obstacle in (UNWATCHED, UNSEEN, SCAN_STALE):
+    if state.obstacle in (UNOBSERVED, UNSEEN, SCAN_STALE):
         return state.obstacle
     if odometry is not None and odometry.depth.panoramas.tiles.unknown.any():
         return "the status names the part"

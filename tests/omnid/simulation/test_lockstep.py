@@ -20,7 +20,7 @@ from calib import se3
 from omnid.cli import main
 from omnid.client import Diagnostics, Robot
 from omnid.config import load_config
-from omnid.core.control.collision_monitor import IMAGES_REMEDY, UNSEEN, UNWATCHED
+from omnid.core.control.collision_monitor import IMAGES_REMEDY, UNOBSERVED, UNSEEN
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.scan_grid import FREE, UNKNOWN
 from omnid.core.places.place_views import grid
@@ -109,7 +109,7 @@ def stop_s(run: SimulatedRun, reason: str) -> float:
 def test_a_base_stops_within_a_second_where_half_of_the_images_freezes_ahead() -> None:
     """It would go on by memory, and by landmarks of the other half."""
     run = fine_drive(Frozen(AHEAD, starts_s=STARTS_S))
-    assert 0.0 < stop_s(run, UNWATCHED) < 1.0
+    assert 0.0 < stop_s(run, UNOBSERVED) < 1.0
     speeds = np.linalg.norm(np.diff([tick.pose[:2] for tick in run.ticks], axis=0), axis=1)
     assert speeds[-20:].max() < 1e-4
     # Landmarks in the dead half would say that the base stands.
@@ -121,7 +121,7 @@ def test_a_base_stops_within_a_second_where_half_of_the_images_freezes_ahead() -
 def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
     """A third of the images, behind it."""
     run = fine_drive(Frozen(BEHIND, starts_s=STARTS_S))
-    assert not [line for _, line in run.lines if UNWATCHED in line]
+    assert not [line for _, line in run.lines if UNOBSERVED in line]
     np.testing.assert_allclose(run.T_odom_base[-1, :2, 3], run.truth_in_odom[-1, :2, 3], atol=0.03)
 
 

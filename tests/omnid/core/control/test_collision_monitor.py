@@ -54,11 +54,11 @@ def after(
     free: tuple[float, ...] = (),
     moving: tuple[MovingPoint, ...] = (),
     age_s: float = 0.1,
-    unwatched: tuple[bool, ...] = (),
+    unobserved: tuple[bool, ...] = (),
 ) -> tuple[Twist, str]:
     """Return the allowed motion and the reason, before a new scan."""
     monitor = CollisionMonitor(settings, 1.5)
-    monitor.set_scan(ControllerScan(10 * S, ranges, free, moving, unwatched))
+    monitor.set_scan(ControllerScan(10 * S, ranges, free, moving, unobserved))
     allowed = monitor.step(10 * S + round(age_s * S), motion)
     return allowed, monitor.reason
 
@@ -184,10 +184,10 @@ def test_a_base_drives_along_what_is_unknown_beside_it(yaw_rate_radps: float, go
 def test_the_base_stops_before_dead_and_blind_parts_of_the_images(unknown: str) -> None:
     """Whatever the setting for the end of the seen floor is: something may have come there."""
     ranges, settings = with_unknown(-30, 30), replace(SETTINGS, unknown=unknown)
-    unwatched = tuple(math.isnan(range_m) for range_m in ranges)
-    assert after(ranges, settings=settings, unwatched=unwatched) == (Twist(), monitor_module.UNWATCHED)
+    unobserved = tuple(math.isnan(range_m) for range_m in ranges)
+    assert after(ranges, settings=settings, unobserved=unobserved) == (Twist(), monitor_module.UNOBSERVED)
     for away in (Twist(-0.5), Twist(0.0, 1.0)):
-        assert after(ranges, away, settings, unwatched=unwatched) == (away, "")
+        assert after(ranges, away, settings, unobserved=unobserved) == (away, "")
 
 
 @pytest.mark.hazard("H23")
@@ -195,7 +195,7 @@ def test_in_the_dark_the_base_does_not_even_turn() -> None:
     """Directions that are unknown because they are plain do not keep a base from turning away; no image at all does."""
     ranges, turn = (math.nan,) * 360, Twist(0.0, 1.0)
     assert after(ranges, turn) == (turn, "")
-    assert after(ranges, turn, unwatched=(True,) * 360) == (Twist(), monitor_module.UNSEEN)
+    assert after(ranges, turn, unobserved=(True,) * 360) == (Twist(), monitor_module.UNSEEN)
 
 
 @pytest.mark.hazard("H21")
@@ -213,9 +213,9 @@ def test_an_older_scan_makes_the_base_no_freer(age_s: float, speed_mps: float) -
     """The end of the floor that was in front of the base is inside its outline by now, or behind it."""
     nothing_ahead = tuple(0.0 if abs(abs(k - 179.5) - 180 * (speed_mps < 0)) < 60 else 6.0 for k in range(360))
     ranges = tuple(math.nan if free == 0.0 else math.inf for free in nothing_ahead)
-    for unwatched in ((), tuple(free == 0.0 for free in nothing_ahead)):
+    for unobserved in ((), tuple(free == 0.0 for free in nothing_ahead)):
         monitor = CollisionMonitor(SETTINGS, 1.5)
-        monitor.set_scan(ControllerScan(10 * S, ranges, nothing_ahead, unwatched=unwatched))
+        monitor.set_scan(ControllerScan(10 * S, ranges, nothing_ahead, unobserved=unobserved))
         for tick in range(round(20 * age_s)):
             monitor.follow(10 * S + tick * S // 20, Twist(speed_mps))
         now_ns = 10 * S + round(age_s * S)
