@@ -86,7 +86,6 @@ class LoggedMessage:
 
     topic: str
     kind: str  # ROS type such as sensor_msgs/msg/Image; "" where the message cannot be decoded
-    log_time_ns: int
     data: memoryview  # CDR
 
     def image(self) -> Frame:
@@ -146,14 +145,14 @@ class Log:
     def message(self, row: int) -> LoggedMessage | None:
         """Return the message of a row of the entries; None, and count it, where it cannot be read."""
         file, name = self.files[self.file[row]], self._names[self.topic[row]]
-        channel, time_ns, _, block, offset = self.entries[row].item()
+        channel, _, _, block, offset = self.entries[row].item()
         try:
             data = unpack_message(memoryview(file.read(channel, block, offset)))
         except RecordError as error:
             if not self._closed:
                 file.faults.setdefault(block or offset, str(error))
             return None
-        return LoggedMessage(name, self.topics[name], time_ns, data)
+        return LoggedMessage(name, self.topics[name], data)
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments of the first file that has some, such as a rig."""

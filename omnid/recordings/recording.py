@@ -45,7 +45,6 @@ class RecordedMessage(NamedTuple):
     """A decoded message; name: last part of its topic, one of the constants above or of omnid.transport.topics."""
 
     name: str
-    log_time_ns: int
     content: Content
 
 
@@ -108,7 +107,7 @@ class RecordingReader:
             except (OmnidError, FrameDecodeError):
                 self.unreadable[message.topic] += 1
                 continue
-            yield RecordedMessage(name, message.log_time_ns, content)
+            yield RecordedMessage(name, content)
 
 
 def _finite_twist(data: bytes) -> TwistRecord:

@@ -56,7 +56,6 @@ class RigCalibration:
     board: AnyBoard
     views: tuple[PairView, ...]  # K
     rejected: tuple[RejectedView, ...] = ()
-    telecentric: bool = False  # True if the cameras were fitted as mirrors below telecentric lenses
 
     @property
     def cameras(self) -> tuple[OcamCamera, ...]:
@@ -146,7 +145,7 @@ def calibrate_boards(
     if view == "mirror":
         with suppress(CalibError, np.linalg.LinAlgError):
             fit = fit_boards(found.fit.rig, _pixels(found.views, board), board, telecentric=True)
-            found = replace(found, fit=fit, telecentric=True) if fit.is_likelier(found.fit) else found
+            found = replace(found, fit=fit) if fit.is_likelier(found.fit) else found
     return replace(found, rejected=tuple(rejected))
 
 
