@@ -23,6 +23,7 @@ PX_PER_INCH = 100
 MARGIN_PX = 64  # for the ticks and the names of the axes
 SIDE_PX = 1400  # of an image, at most
 MOST_PX_PER_M = 100.0  # of a small map
+CHUNK = 1000  # points of a line that are drawn at once: agg refuses long ones that turn everywhere, as of a wrong pose
 _CELL_M = 0.05  # default voxel: at a finer scale cells are drawn as squares, not as scattered dots
 
 
@@ -123,10 +124,12 @@ def draw_plan(xy_m: Array, confidence: NDArray[np.float32], lines: Sequence[Line
 
 def image_of(axes: Axes) -> Image:
     """Return the figure of axes as a BGR image (H, W, 3)."""
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(axes.figure.figure)
-    canvas.draw()  # type: ignore[no-untyped-call]
+    with rc_context({"agg.path.chunksize": CHUNK}):
+        canvas.draw()  # type: ignore[no-untyped-call]
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., 2::-1])  # type: ignore[no-untyped-call]
 
 
