@@ -39,7 +39,7 @@ _KEY: Final = re.compile(rb"\x1b(?:\[[0-?]{0,16}|O)[@-~]|.", re.DOTALL)
 
 @dataclass
 class Stick:
-    """Keys as a stick: each side is held for HOLD_S after its last key."""
+    """Keys as a stick: a side counts as pressed for HOLD_S after its last key."""
 
     limits: VelocityLimits
     share: float = 0.4  # of the highest speeds, at the start
@@ -66,8 +66,8 @@ class Stick:
 
     def twist(self, now_s: float) -> tuple[float, float]:
         """Return forward speed [m/s] and yaw rate [rad/s]."""
-        held = {side for side, pressed_s in self._pressed_s.items() if now_s - pressed_s <= HOLD_S}
-        forward, turn = ("forward" in held) - ("back" in held), ("left" in held) - ("right" in held)
+        pressed = {side for side, pressed_s in self._pressed_s.items() if now_s - pressed_s <= HOLD_S}
+        forward, turn = ("forward" in pressed) - ("back" in pressed), ("left" in pressed) - ("right" in pressed)
         return (self.share * forward * self.limits.velocity_mps, self.share * turn * self.limits.yaw_rate_radps)
 
     def is_moving(self, now_s: float) -> bool:

@@ -175,8 +175,8 @@ class RobotFeed:
                 self._set(PANORAMA, self.version + 1)
 
 
-def _text(words: str, status: HTTPStatus) -> Response:
-    return PlainTextResponse(f"omnid web: {words}\n", status)
+def _text(text: str, status: HTTPStatus) -> Response:
+    return PlainTextResponse(f"omnid web: {text}\n", status)
 
 
 def server_ms() -> int:
@@ -219,8 +219,8 @@ def parts_news(state: RobotState) -> list[dict[str, Any]]:
     """Return the status entries of which the page shows the values."""
     found = [part for name in (CALIBRATION, MAP_FILE) if (part := state.statuses.get(name)) is not None]
     return [
-        {"name": short_name(it.name), "level": it.level, "message": it.message, "values": list(it.values.items())}
-        for it in found
+        {"name": short_name(part.name), "level": part.level, "message": part.message, "values": [*part.values.items()]}
+        for part in found
     ]
 
 
