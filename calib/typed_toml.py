@@ -51,15 +51,15 @@ _NAMES: Final = MappingProxyType(
 _SHOWN: Final = 60  # characters of a value in a message
 
 
-def bytes_of(path: str | PathLike[str], most: int) -> bytes:
-    """Return the content of a file of at most `most` bytes; raise ValueError for larger or unreadable files."""
+def bytes_of(path: str | PathLike[str], limit: int) -> bytes:
+    """Return the content of a file of at most `limit` bytes; raise ValueError for larger or unreadable files."""
     try:
         with open(path, "rb") as file:
-            data = file.read(most + 1)
+            data = file.read(limit + 1)
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if len(data) > most:
-        raise ValueError(f"has more than {most} bytes: is it the right file?")
+    if len(data) > limit:
+        raise ValueError(f"has more than {limit} bytes: is it the right file?")
     return data
 
 

@@ -13,15 +13,15 @@ MAX_CHARACTERS: Final = 400
 MAX_ENTRIES: Final = 64  # of parts in a status, and of values in a part
 
 
-def plain(text: str, most: int = MAX_CHARACTERS) -> str:
-    """Return a text of printable characters, of which there are `most` at most."""
-    shown = text[:most]
-    return shown if shown.isprintable() else "".join(map(_escaped, shown))[:most]
+def plain(text: str, max_length: int = MAX_CHARACTERS) -> str:
+    """Return a text of printable characters, of which there are max_length at most."""
+    shown = text[:max_length]
+    return shown if shown.isprintable() else "".join(map(_escaped, shown))[:max_length]
 
 
-def one_line(message: object, most: int = MAX_CHARACTERS) -> str:
+def one_line(message: object, max_length: int = MAX_CHARACTERS) -> str:
     """Return a message in one line of printable characters; white space of any length becomes one blank."""
-    return plain(" ".join(str(message).split()), most)
+    return plain(" ".join(str(message).split()), max_length)
 
 
 def _escaped(letter: str) -> str:

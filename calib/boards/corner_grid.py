@@ -73,13 +73,13 @@ def _flood_fill(seed: int, neighbour: NDArray[np.int64], back: NDArray[np.int64]
     return cells
 
 
-def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
+def grow_grid(image: Grey, grid: Grid, max_count: int) -> Grid:
     """Return the grid with every corner added that the mapping of its neighbours predicts and the image shows.
 
     A grid of more than most corners does not grow any further.
     """
     grid, refused = dict(grid), set[Cell]()
-    while len(grid) <= most:
+    while len(grid) <= max_count:
         at, where = np.array(list(grid), float), np.array(list(grid.values()))
         border = {(i + di, j + dj) for i, j in grid for di, dj in STEPS} - set(grid) - refused
         mappings = {cell: local_mapping(np.array(cell, float), at, where) for cell in border}

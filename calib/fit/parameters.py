@@ -115,8 +115,8 @@ class RigParameters:
     ) -> RigParameters:
         """Return the parameters of a rig's camera models, with the rig's own values at steps of 0.
 
-        distortion: names of the terms of omni cameras that are parameters even where the rig has 0 for them. times: of
-        TIME_UNITS. waves: True if the wavefronts of ocam cameras are parameters.
+        distortion: names of the terms of omni cameras that are parameters even where the rig has 0 for them. times:
+        of TIMES. waves: True if the wavefronts of ocam cameras are parameters.
         """
         cameras = (("lower", rig.lower.camera), ("upper", rig.upper.camera))
         own = [f"{side} {name}" for side, camera in cameras for name in central_names(camera, distortion)]

@@ -39,7 +39,7 @@ class V4l2Settings:
     width_px: int = 1280
     height_px: int = 960
     rate_hz: float = 30.0  # 0: the device's own
-    pixel_format: str = "auto"  # or a key of ENCODINGS of v4l2_device
+    pixel_format: str = "auto"  # or a key of ENCODINGS
     auto_exposure: str = "keep"  # keep, on, off or rig: set by a run, by the requests of CameraExposure, else as "on"
     exposure_us: int = 0  # above 0: fixed, automatic exposure off; in steps of 100
     gain: int = -1  # 0 and above: fixed, in the device's own units, automatic gain off

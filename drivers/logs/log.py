@@ -192,8 +192,8 @@ def unpack_message(data: memoryview) -> memoryview:
         raise RecordError(f"it does not unpack: {error}") from error
 
 
-def listed(names: Iterable[str], none: str = "", most: int = 16) -> str:
+def listed(names: Iterable[str], none: str = "", max_count: int = 16) -> str:
     """Return names in one line, at most so many, with unprintable characters escaped; none: the text for no names."""
     every = sorted(names)
-    shown = ", ".join(name if name.isprintable() else ascii(name)[1:-1] for name in every[:most])
-    return (shown or none) + (f" and {len(every) - most} more" if len(every) > most else "")
+    shown = ", ".join(name if name.isprintable() else ascii(name)[1:-1] for name in every[:max_count])
+    return (shown or none) + (f" and {len(every) - max_count} more" if len(every) > max_count else "")

@@ -112,9 +112,9 @@ def _read(path: Path, bits: int) -> Image:
     return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, bits), np.uint8)
 
 
-def spread_pairs(reader: LogReader, most: int, tolerance_ns: float) -> Iterator[tuple[int, Frame, Frame]]:
-    """Yield number, lower and upper frame of at most `most` pairs, evenly spread over a log, undecoded."""
-    stride = max(1, -(-sum(1 for _ in _paired(reader.frames(), tolerance_ns)) // most))
+def spread_pairs(reader: LogReader, max_count: int, tolerance_ns: float) -> Iterator[tuple[int, Frame, Frame]]:
+    """Yield number, lower and upper frame of at most max_count pairs, evenly spread over a log, undecoded."""
+    stride = max(1, -(-sum(1 for _ in _paired(reader.frames(), tolerance_ns)) // max_count))
     for number, (lower, upper) in enumerate(_paired(reader.frames(), tolerance_ns)):
         if number % stride == 0:
             yield number, lower, upper

@@ -53,7 +53,7 @@ def print_config(args: argparse.Namespace) -> int:
     if args.action == "print":
         print(dump(config, FIRST_SETTINGS if args.minimal else None), end="")
         return 0
-    # Words that only the daemon's start would refuse.
+    # Texts that only the start of the daemon would refuse.
     zenoh_config(config.bus)
     motor_protocol(config.motor.protocol)
     print(f"{args.file}: good")

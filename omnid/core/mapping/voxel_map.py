@@ -37,9 +37,9 @@ class VoxelMap:
     variance, or outside +-2^20 voxels.
     """
 
-    def __init__(self, voxel_m: float = 0.05, most: int = 180_000) -> None:
-        """voxel_m: edge of a voxel. most: largest number of voxels."""
-        self._voxel_m, self._most = voxel_m, most
+    def __init__(self, voxel_m: float = 0.05, max_voxels: int = 180_000) -> None:
+        """voxel_m: edge of a voxel."""
+        self._voxel_m, self._max_voxels = voxel_m, max_voxels
         self._newest_seq = 0
         self._voxels = np.zeros(0, VOXEL)
 
@@ -71,7 +71,7 @@ class VoxelMap:
         self._voxels[at[is_known]] = known
         # 3. New ones.
         self._voxels = np.insert(self._voxels, at[~is_known], seen[~is_known])
-        if len(self) > self._most:
+        if len(self) > self._max_voxels:
             self._evict()
 
     def points(self, min_frames: int = 2) -> MapPoints:
@@ -93,16 +93,16 @@ class VoxelMap:
     def _evict(self) -> None:
         """Drop half of the voxels: the least confident ones, of equal ones those seen last long ago."""
         order = np.lexsort((self._voxels["last_seq"], self._confidence()))
-        dropped = len(order) - self._most // 2
+        dropped = len(order) - self._max_voxels // 2
         self._voxels = self._voxels[np.sort(order[dropped:])]
 
 
 class ThinnedPath:
     """Vertices at least a step apart, and the end of the path; when there are too many, every second one is dropped."""
 
-    def __init__(self, most: int, step_m: float) -> None:
-        """most: largest number of vertices, at least 2. step_m: spacing at first, which doubles."""
-        self._most, self._step_m = most, step_m
+    def __init__(self, max_vertices: int, step_m: float) -> None:
+        """max_vertices: 2 or more. step_m: spacing at first, which doubles."""
+        self._max_vertices, self._step_m = max_vertices, step_m
         self.vertices: list[tuple[float, float]] = []  # x, y, m
 
     def add(self, x_m: float, y_m: float) -> None:
@@ -110,7 +110,7 @@ class ThinnedPath:
         if len(self.vertices) > 1 and math.dist(*self.vertices[-2:]) < self._step_m:
             self.vertices.pop()
         self.vertices.append((x_m, y_m))
-        if len(self.vertices) > self._most:
+        if len(self.vertices) > self._max_vertices:
             self.vertices, self._step_m = [*self.vertices[:-1:2], self.vertices[-1]], 2 * self._step_m
 
     def xy(self) -> Array:

@@ -27,8 +27,8 @@ NOISE_RESPONSE = 2.5e-5
 REACH_PX = 3  # eq. (8): largest distance, in column and in row, of a located pixel from a feature
 
 
-def corners(lower: PaddedPanorama, usable: Flags, most: int) -> Array:
-    """Return up to `most` corners (N, 2) = (column, row) of the panorama where usable (H, W), strongest first per cell.
+def corners(lower: PaddedPanorama, usable: Flags, max_count: int) -> Array:
+    """Return corners (N, 2) = (column, row), at most max_count, where usable (H, W), strongest first per cell.
 
     A corner is a maximum of the smaller eigenvalue (Shi and Tomasi 1994) within APART_PX. Cells of CELL_PX take turns,
     so that one poster full of contrast does not take all.
@@ -43,7 +43,7 @@ def corners(lower: PaddedPanorama, usable: Flags, most: int) -> Array:
     rows, columns = rows[strongest], columns[strongest]
     cell_px = at_scale(CELL_PX, lower.scale)
     rank = _rank_within((rows // cell_px) * lower.width + columns // cell_px)
-    chosen = np.argsort(rank, kind="stable")[: max(0, most)]
+    chosen = np.argsort(rank, kind="stable")[: max(0, max_count)]
     return np.column_stack([columns[chosen], rows[chosen]]).astype(float)
 
 

@@ -221,20 +221,26 @@ class LocalMap:
         self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
 
     def track(
-        self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0, near: bool = False
+        self,
+        lower: PaddedPanorama,
+        T_odom_rect: Array,
+        max_count: int | None = None,
+        *,
+        phase: int = 0,
+        near: bool = False,
     ) -> Tracks:
         """Track landmarks of the last panorama into a new one, from the pixels that a guessed pose predicts.
 
-        most: about this number of landmarks, evenly chosen; None: all. turn: selects which ones. near: the guess is
-        good to a few pixels, so that no pyramid is needed; where it is not, wrong tracks pass the check.
+        max_count: about this number of landmarks, evenly chosen; None: all. phase: selects which ones. near: the guess
+        is good to a few pixels, so that no pyramid is needed; where it is not, wrong tracks pass the check.
         """
         rows, predicted = self.visible(T_odom_rect)
         known = np.isfinite(self.table.pixels[rows, 0])
         rows, predicted = rows[known], predicted[known]
         count = len(rows)
-        if most is not None:
-            every = max(1, -(-count // most))
-            chosen = np.flatnonzero((self.table.id[rows] + turn) % every == 0)
+        if max_count is not None:
+            every = max(1, -(-count // max_count))
+            chosen = np.flatnonzero((self.table.id[rows] + phase) % every == 0)
             rows, predicted = rows[chosen], predicted[chosen]
         if self.last is None:
             return Tracks(rows[:0], np.zeros((0, 2)), predicted[:0], 0)
@@ -242,10 +248,10 @@ class LocalMap:
         pixels, found = track(self.last, lower, before, predicted[:, :2], self._near_klt if near else self._coarse_klt)
         return Tracks(rows[found], pixels[found], predicted[found], len(rows), count / max(1, len(rows)))
 
-    def last_seen(self, most: int) -> tuple[PaddedPanorama | None, Indices]:
-        """Return the last panorama, and about `most` evenly chosen landmarks (M,) that were found in it."""
+    def last_seen(self, max_count: int) -> tuple[PaddedPanorama | None, Indices]:
+        """Return the last panorama, and about max_count evenly chosen landmarks (M,) that were found in it."""
         rows = np.flatnonzero(np.isfinite(self.table.pixels[:, 0]))
-        return self.last, rows[:: max(1, -(-len(rows) // most))]
+        return self.last, rows[:: max(1, -(-len(rows) // max_count))]
 
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
         """Return the landmarks (M,) that a pose predicts in live parts of the panorama, and their views (M, 3) [px]."""

@@ -86,7 +86,7 @@ class PoseSearch:
             se3.transform(T_last[:3, :3] @ se3.rotation_exp([0, 0, yaw_rad]), T_predicted[:3, 3])
             for yaw_rad in correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
         ]
-        tracks = [self._map.track(frame.lower, T_guess, most=LANDMARKS) for T_guess in guesses]
+        tracks = [self._map.track(frame.lower, T_guess, max_count=LANDMARKS) for T_guess in guesses]
         return guesses[int(np.argmax([len(each.landmarks) / max(1, each.visible) for each in tracks]))]
 
     def others(
@@ -111,7 +111,7 @@ class PoseSearch:
         of inliers is the smaller one of both.
         """
         # 1. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
-        tracks = self._map.track(frame.lower, T_guess, self._tracked, turn=frame.seq, near=is_near)
+        tracks = self._map.track(frame.lower, T_guess, self._tracked, phase=frame.seq, near=is_near)
         if len(tracks.landmarks) < MIN_LANDMARKS:
             return None
         T_guess_odom = se3.inverse(T_guess)

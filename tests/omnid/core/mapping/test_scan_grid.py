@@ -211,7 +211,7 @@ def row(start: int, count: int) -> Array:
 
 def test_agrees_with_a_dictionary() -> None:
     rng = np.random.default_rng(5)
-    voxels = VoxelMap(voxel_m=0.1, most=4096)
+    voxels = VoxelMap(voxel_m=0.1, max_voxels=4096)
     sums: dict[tuple[int, ...], Array] = {}
     seen: dict[tuple[int, ...], list[int]] = {}
     for seq in range(20):
@@ -230,7 +230,7 @@ def test_agrees_with_a_dictionary() -> None:
 
 
 def test_evicts_the_least_confident_voxels_and_the_oldest_of_these() -> None:
-    voxels = VoxelMap(voxel_m=1.0, most=44)
+    voxels = VoxelMap(voxel_m=1.0, max_voxels=44)
     voxels.insert(row(0, 15), var(15, 1e-2), seq=0)  # seen once and long ago
     for seq in (100, 101):
         voxels.insert(row(100, 15), var(15, 1e-2), seq)
