@@ -39,17 +39,16 @@ def collect(log: Path, rig: Rig, cameras: LogCameras, config: Config) -> tuple[D
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
     landmarks = DriveLandmarks(place.model(config.odometry.noise_px))
     T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
-    since = 0
+    since = 0  # pairs since the last keyframe
     with closing(LogReader(log, cameras, place.rig.topics)) as reader:
-        # Least number of pairs between two keyframes.
-        apart = max(1, -(-(reader.pair_estimate() or 0) // MAX_KEYFRAMES))
+        min_pairs = max(1, -(-(reader.pair_estimate() or 0) // MAX_KEYFRAMES))
         for update in tracked_updates(reader, front_end, config, log):
             # 1. Choose the poses that are far enough apart to add information.
             T_odom_rig, since = update.T_odom_rig, since + 1
             if T_rig_odom:
                 moved = se3.log(T_rig_odom[-1] @ T_odom_rig)
                 still = np.linalg.norm(moved[:3]) < KEYFRAME_M and np.linalg.norm(moved[3:]) < KEYFRAME_RAD
-                if still or since < apart or update.state is TrackingState.LOST:
+                if still or since < min_pairs or update.state is TrackingState.LOST:
                     continue
             since = 0
             # 2. Follow the landmarks to this keyframe.

@@ -22,7 +22,7 @@ Image = NDArray[np.uint8]
 PX_PER_INCH = 100
 MARGIN_PX = 64  # for the ticks and the names of the axes
 SIDE_PX = 1400  # of an image, at most
-MOST_PX_PER_M = 100.0  # of a small map
+MAX_PX_PER_M = 100.0  # of a small map
 CHUNK = 1000  # points of a line that are drawn at once: agg refuses long ones that turn everywhere, as of a wrong pose
 _CELL_M = 0.05  # default voxel: at a finer scale cells are drawn as squares, not as scattered dots
 
@@ -96,7 +96,7 @@ def draw_plan(xy_m: Array, confidence: NDArray[np.float32], lines: Sequence[Line
     half_m = np.maximum(1.06 / 2 * (high_m - low_m), 1.0)
     half_m = np.maximum(half_m, 0.1 * half_m.max())
     low_m, high_m = (low_m + high_m) / 2 - half_m, (low_m + high_m) / 2 + half_m
-    px_per_m = min((SIDE_PX - 2 * MARGIN_PX) / (2 * float(half_m.max())), MOST_PX_PER_M)
+    px_per_m = min((SIDE_PX - 2 * MARGIN_PX) / (2 * float(half_m.max())), MAX_PX_PER_M)
     size_px = np.floor(2 * half_m * px_per_m) + 2 * MARGIN_PX
     figure = Figure(figsize=tuple((size_px / PX_PER_INCH).tolist()), dpi=PX_PER_INCH)
     axes = figure.add_axes((*(MARGIN_PX / size_px), *(1 - 2 * MARGIN_PX / size_px)))
@@ -104,8 +104,8 @@ def draw_plan(xy_m: Array, confidence: NDArray[np.float32], lines: Sequence[Line
     cell_m = np.ceil(px_per_m * _CELL_M) / px_per_m
     edges = [low + cell_m * np.arange(2 + (high - low) // cell_m) for low, high in zip(low_m, high_m, strict=True)]
     density = np.histogram2d(xy_m[:, 0], xy_m[:, 1], edges, weights=confidence)[0].T
-    usual = float(np.median(density[density > 0])) if density.any() else 1.0
-    grey = np.where(density > 0, 190.0 - 190.0 * density / (density + usual), 255.0)
+    median = float(np.median(density[density > 0])) if density.any() else 1.0
+    grey = np.where(density > 0, 190.0 - 190.0 * density / (density + median), 255.0)
     extent = (edges[0][0], edges[0][-1], edges[1][0], edges[1][-1])
     axes.imshow(grey, "gray", vmin=0, vmax=255, interpolation="nearest", origin="lower", extent=extent, aspect="auto")
     # 3. The lines, and both ends of the path.

@@ -1,1 +1,5 @@
-"""omnid as a service of systemd: `install.py` copies the files of `systemd/`, which the wheel carries."""
+"""omnid as a service of systemd.
+
+`install.py` lists and writes the files of `omnid install-service`: units, udev rules and a first configuration, from
+the folder `systemd/`, which the wheel carries. Files that people edit are kept.
+"""
