@@ -15,7 +15,6 @@ from typing import Any
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame
-from drivers.motion import GyroSample
 from drivers.motor import VelocityCommand
 from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
@@ -40,7 +39,7 @@ class PacedRobot:
 
     def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int) -> None:
         """Set the robot up, with the controller of the settings."""
-        self.rig, self._motion = robot.rig, config.motion
+        self.rig = robot.rig
         self._start_ns = self._first_ns = time.monotonic_ns()  # of the computer when the first pair was given, too
         self._report: Callable[[str], None] = no_op
         self._vehicle = Vehicle(
@@ -112,8 +111,7 @@ class PacedRobot:
             for pair in vehicle.pairs(settle):
                 self.truth[pair.stamp_ns] = vehicle.base.pose
                 for sample in pair.samples:
-                    if (self._motion.imu if isinstance(sample, GyroSample) else self._motion.wheels) != "off":
-                        motion.add(sample)
+                    motion.add(sample)
                 # Images are not given before their time; a pair that comes late is not made up for.
                 sleep_until(due_ns, lambda: self._closed)
                 if self._closed:

@@ -68,8 +68,6 @@ class SimulatedRobot:
     gyro_bias_radps: tuple[float, float, float] = (0.004, -0.003, 0.006)  # about base x, y, z
     gyro_noise_radps: float = 0.003  # standard deviation of a sample
     gyro_hz: float = 100.0
-    has_odometry: bool = True  # the daemon is given what the motor controller reports of its wheels
-    has_gyro: bool = True
     rate_hz: float = 10.0  # of the cameras
     samples: int = 2  # in lock-step: rays of a pixel, per axis
     pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
@@ -164,6 +162,7 @@ class Vehicle:
     ) -> None:
         """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s]."""
         self.world, self.robot, self.people = world, robot, Walkers(world.people)
+        self._has_odometry, self._has_gyro = config.motion.wheels != "off", config.motion.imu != "off"
         self.now_ns = self._start_ns = self._tick_ns = self._gyro_ns = start_ns
         self._take_tick = take_tick
         self.cameras = self.make_cameras(robot.rig, robot.sensor, world, seed, robot.samples)
@@ -284,7 +283,7 @@ class Vehicle:
         before, dt_s = self.base.pose, (until_ns - self.now_ns) * 1e-9
         self.now_ns = until_ns
         self.move(dt_s)
-        if self.robot.has_gyro and dt_s > 0.0:
+        if self._has_gyro and dt_s > 0.0:
             turned_radps = self.world.turned_rad(before, self.base.pose) / dt_s
             noise = (self.robot.gyro_noise_radps * self._gyro_noise.gauss(0.0, 1.0) for _ in range(3))
             parts = zip(self.robot.gyro_bias_radps, noise, turned_radps.tolist(), strict=True)
@@ -293,7 +292,7 @@ class Vehicle:
 
     def _tick(self) -> None:
         report, status, pose = self.controller.tick(), self.motor.status, self.base.pose
-        if self.robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
+        if self._has_odometry and status is not None and math.isfinite(status.velocity_mps):
             self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
         walking = self.world.footprints(self.people.faces(), self.robot.height_m)
         nearest_m = min(clearance_m(one, pose[:2], self.robot.radius_m) for one in (self._obstacles, walking))

@@ -167,9 +167,12 @@ def goals(
     for name in CASES if "all" in cases else cases:
         case = CASES[name]
         for seed in seeds:
-            robot = disturbed(make_robot(size), slips=case.slips, has_odometry=case.sensors, has_gyro=case.sensors)
+            robot, faults = disturbed(make_robot(size), slips=case.slips), case.faults
+            config = load_config(None, () if case.sensors else ("motion.wheels=off", "motion.imu=off"))
             started_s, script = time.process_time(), Goals(case.goals)
-            driven = simulate(case.world(seed), robot, script, seconds=case.seconds, seed=seed, faults=case.faults)
+            driven = simulate(
+                case.world(seed), robot, script, seconds=case.seconds, seed=seed, config=config, faults=faults
+            )
             spent_s = (time.process_time() - started_s) / max(1, len(driven.poses))
             table.add(name, seed, *row(case, driven), spent_s, seed=(f"drive {name}", seed))
 

@@ -129,8 +129,9 @@ def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
 @pytest.mark.parametrize("gyro", [True, False])
 def test_in_the_dark_a_base_stops_although_wheels_carry_its_pose(gyro: bool) -> None:
     """Half a second, and the ramp."""
-    robot, dark = replace(make_robot(SIZE_PX), samples=1, has_gyro=gyro), Fault("dark", STARTS_S, 9.0)
-    run = simulate(world(), robot, ahead, seconds=3.0, seed=1, config=WITHOUT_PLACES, faults=(dark,))
+    robot, dark = replace(make_robot(SIZE_PX), samples=1), Fault("dark", STARTS_S, 9.0)
+    config = load_config(None, ["places.enabled=false", f"motion.imu={'auto' if gyro else 'off'}"])
+    run = simulate(world(), robot, ahead, seconds=3.0, seed=1, config=config, faults=(dark,))
     assert 0.0 < stop_s(run, UNSEEN) < 0.5
     assert "lost" not in {pose.state for pose in run.poses}
 
