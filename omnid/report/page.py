@@ -37,11 +37,11 @@ class Curve(NamedTuple):
 
 
 def chart(title: str, curves: Sequence[Curve], unit: str = "", *, log: bool = False, note: str = "") -> str:
-    """Return a figure; "" where all curves are empty. Lengths below 0.1 m are shown in mm."""
+    """Return a figure; "" where no curve has two values. Lengths below 0.1 m are shown in mm."""
     shown = []
     for name, t_s, values in curves:
         valid = np.isfinite(values) & ((values > 0) | (not log))
-        if valid.any():
+        if np.count_nonzero(valid) > 1:
             shown.append(Curve(name, t_s[valid], values[valid]))
     if not shown:
         return ""

@@ -155,6 +155,8 @@ def test_the_axes_of_another_body_are_fitted(
     assert found["ate_rmse_m"] == pytest.approx(known.ate_rmse_m) and found["heading_rmse_rad"] < 0.02
     assert main(["eval", est, true, "--frame", "auto"]) == 0
     assert "fitted, so the errors are optimistic" in capsys.readouterr().out
+    assert main(["eval", est, true]) == 0
+    assert "try --frame auto" in capsys.readouterr().out
 
 
 # The rule for which topic holds the poses: one table of cases, through all commands that read recorded runs
