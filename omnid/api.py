@@ -22,7 +22,6 @@ from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
 from omnid.config import Config, load_config, unused_settings
 from omnid.engine.graph import Lock
-from omnid.engine.kernel_cache import prepare_kernels
 from omnid.errors import OmnidError
 from omnid.messages import DensePoints, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, RunResult, run_log
@@ -97,7 +96,6 @@ class Odometry:
         Raises OmnidError for a rig or a configuration that cannot be used.
         """
         with _user_errors():
-            prepare_kernels()
             settings = _config(config, overrides)
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}

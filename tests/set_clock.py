@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from omnid.engine.graph import no_op
 from omnid.engine.robot_clock import RobotClock
 
 
@@ -27,6 +24,6 @@ class SetClock:
         """Set Unix time; below 0: back."""
         self.offset_ns += round(seconds * 1e9)
 
-    def clock(self, report: Callable[[str], object] = no_op) -> RobotClock:
+    def clock(self) -> RobotClock:
         """Return the robot's clock on this computer."""
-        return RobotClock(lambda: self.monotonic_ns, lambda: self.unix_ns, report)
+        return RobotClock(lambda: self.monotonic_ns, lambda: self.unix_ns)

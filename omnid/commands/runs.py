@@ -110,11 +110,11 @@ def simulate(args: argparse.Namespace) -> int:
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
     paced = PacedRobot(world, robot, config, args.seed)
-    clock = run_live(config, paced, paced.rig)
+    run_live(config, paced, paced.rig)
     # 2. Write the truth, and report contacts.
     if args.truth:  # the poses of the base since the first one, with the stamps of the poses on the bus
         T = np.array([transform(np.array(pose)) for pose in paced.truth.values()]).reshape(-1, 4, 4)
-        stamps_ns = np.array([clock.unix_ns(stamp_ns) for stamp_ns in paced.truth], np.int64)
+        stamps_ns = np.array([paced.clock.unix_ns(stamp_ns) for stamp_ns in paced.truth], np.int64)
         write_trajectory(args.truth, stamps_ns, se3.inverse(T[:1]) @ T)
     log(logging.INFO, f"contacts with obstacles: {paced.contacts}")
     return 0

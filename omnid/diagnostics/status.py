@@ -31,7 +31,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.commands import CommandReceiver
-from omnid.transport.status_names import NOTABLE_SHARE, TIMEOUT_S, Key, Stats, by_reason, entry, times
+from omnid.transport.status_names import NOTABLE_SHARE, TIMEOUT_S, Key, Stats, by_reason, entry
 
 
 class RunStatistics:
@@ -209,11 +209,11 @@ class StatusCollector:
         found |= {f"{status_names.PREFIX}{name} camera": self._camera(name) for name in self._cameras}
         found |= {name: stats() for name, stats in self._parts.items()}
         for name, stage in self._stages.items():
-            found[status_names.stage_name(name)] = {
+            found[f"{status_names.STAGE_PREFIX}{name}"] = {
                 Key.RATE_HZ: self._rate_hz(name, stage.processed),
                 Key.PROCESSED: stage.processed,
                 Key.DROPPED: stage.dropped,
-                **times(status_names.WORK, stage.wall),  # for a message
+                **stage.wall.times_ms(status_names.WORK),  # for a message
             }
         return [entry(name, stats) for name, stats in found.items()]
 
@@ -243,7 +243,7 @@ class StatusCollector:
             Key.RUN: status_names.RUN_ID,
             Key.RESETS: newest.reset_counter,
             "length_m": self._statistics.length_m,
-            **times(status_names.CAPTURE_TO_POSE, self._statistics.latency),
+            **self._statistics.latency.times_ms(status_names.CAPTURE_TO_POSE),
             **({"_stale": "no new pose"} if age_s > TIMEOUT_S else {severity: with_reason(state, fault)}),
         }
 
@@ -308,7 +308,7 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         "stops": commands.stops,
         "command_refusal": commands.wheels.refusal,  # why the newest refused command was refused
         **by_reason(status_names.REFUSED_PREFIX, commands.wheels.refused),
-        **times(status_names.TICK_LATE, controller.lateness),
+        **controller.lateness.times_ms(status_names.TICK_LATE),
         Key.ARMED: int(state.armed),
         Key.DISARMED_BY: state.disarmed_by,
         Key.REMEDY: remedy(state.obstacle) if state.blocked else arm,

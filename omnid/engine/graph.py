@@ -16,7 +16,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -94,9 +94,10 @@ class Histogram:
         found_s = sorted(self._recent_s.copy())
         return found_s[max(0, math.ceil(q * len(found_s)) - 1)] if found_s else math.nan
 
-    def times_ms(self) -> dict[str, float]:
-        """Return median, 99th percentile and maximum, ms; NaN before the first."""
-        return {"p50_ms": 1e3 * self.p(0.5), "p99_ms": 1e3 * self.p(0.99), "max_ms": 1e3 * self.max_s}
+    def times_ms(self, name: str = "") -> dict[str, float]:
+        """Return median, 99th percentile and maximum, ms; NaN before the first. name: begins their keys."""
+        found_s = {"p50": self.p(0.5), "p99": self.p(0.99), "max": self.max_s}
+        return {f"{name}_{key}_ms".lstrip("_"): 1e3 * value_s for key, value_s in found_s.items()}
 
 
 @dataclass(slots=True)
@@ -125,7 +126,11 @@ class StageStats:
 
 
 class Stage(Protocol[In_contra, Out_co]):
-    """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end."""
+    """A step of the flow.
+
+    It may also have `finish() -> Iterable[Out]` for the results left at the end, and `complete()` for work that begins
+    when the result of a message has been passed on, so that no reader waits for it.
+    """
 
     def process(self, message: In_contra, /) -> Out_co | None:
         """Return the result of the message, None without one; a sink, which is an end of the flow, returns None."""
@@ -158,15 +163,18 @@ class Stream(Generic[T_co]):
 class _Node:
     """A stage or a sink with its counters and its output; after an error it drops its messages, and counts them."""
 
-    def __init__(self, graph: Graph, name: str, work: Any, writers: int, thread: str) -> None:
-        """writers: number of streams that it reads."""
-        self.stats, self.writers, self._graph, self._work = graph.counters(name), writers, graph, work
-        self._name = name
+    def __init__(self, graph: Graph, name: str, work: Any, inputs: Sequence[Stream[Any]], thread: str) -> None:
+        """thread: name of the thread in which it runs."""
+        self.stats, self.writers, self._graph, self._work = graph.counters(name), len(inputs), graph, work
+        self.name, self.inputs, self.depth, self.is_end = name, inputs, 0, False
         self.stream: Stream[Any] = Stream(thread)
+        self._complete: Callable[[], object] = no_op
+        if hasattr(work, "complete"):
+            self._complete = partial(graph.counters(f"{name} completion").timed, work.complete)
 
     def put(self, message: object) -> None:
         """Process the message, and pass on its result; at the end of the last input, the remaining results and END."""
-        graph, name = self._graph, self._name
+        graph, name = self._graph, self.name
         has_failed = name in graph.failed
         if message is END:
             self.writers -= 1
@@ -183,6 +191,7 @@ class _Node:
                 result = self.stats.timed(getattr(self._work, "process", self._work), message)
                 if result is not None:
                     self.stream.push(result)
+                self._complete()
 
 
 class _Inbox:
@@ -261,6 +270,7 @@ class Graph:
         self._sources: dict[str, Callable[[], object]] = {}  # bodies of the threads of sources, by their names
         self._wakes: dict[str, Callable[[], None]] = {}
         self._inlets: list[Stream[Any]] = []
+        self._nodes: list[_Node] = []  # that are not attached to their inputs yet
         self._inboxes: dict[str, _Inbox] = {}  # by thread
         self.failed: set[str] = set()  # names of stages
         self._errors: list[BaseException] = []
@@ -296,26 +306,41 @@ class Graph:
         self._inlets.append(Stream(thread, depth))
         return self._inlets[-1]
 
-    def stage(
-        self, name: str, stage: Step[In, Out], *inputs: Stream[In], thread: str = "", depth: int = 0
-    ) -> Stream[Out]:
-        """Add a stage or a sink, whose inputs merge; return its output.
+    def stage(self, name: str, stage: Step[In, Out], *inputs: Stream[In], thread: str = "") -> Stream[Out]:
+        """Add a stage, whose inputs merge; return its output. A stage whose output has no reader does not run.
 
         thread: name of the thread in which it runs; empty: its own. Messages within a thread are passed on directly,
-        without an inbox. depth: of its inbox, if not that of the graph.
+        without an inbox.
         """
-        thread = thread or name
-        node = _Node(self, name, stage, len(inputs), thread)
-        for stream in inputs:
-            if not self.threaded or stream.thread == thread:
-                stream.readers.append(node.put)
-                continue
-            inbox = self._inboxes.setdefault(thread, _Inbox(self))
-            drops = self.drops or bool(stream.depth)
-            stream.readers.append(inbox.reader(node, stream.depth or depth or self._depth, drops=drops))
-        return node.stream
+        self._nodes.append(_Node(self, name, stage, inputs, thread or name))
+        return self._nodes[-1].stream
 
-    sink = stage
+    def sink(
+        self, name: str, sink: Step[In, Out], *inputs: Stream[In], thread: str = "", depth: int = 0
+    ) -> Stream[Out]:
+        """Add a stage that runs without a reader, too. depth: of its inbox, if not that of the graph."""
+        output = self.stage(name, sink, *inputs, thread=thread)
+        self._nodes[-1].is_end, self._nodes[-1].depth = True, depth
+        return output
+
+    def connect(self) -> None:
+        """End the wiring: attach all that is read to its inputs. `run` does it, unless inlets are to work before."""
+        while self._nodes:
+            node = self._nodes.pop()
+            if not (node.is_end or node.stream.readers):
+                del self.stats[node.name]
+                continue
+            # From the last stage to the first: its readers are known, and are served in the order of the wiring.
+            for stream in node.inputs:
+                stream.readers.insert(0, self._reader(node, stream))
+
+    def _reader(self, node: _Node, stream: Stream[Any]) -> Callable[[object], None]:
+        thread = node.stream.thread
+        if not self.threaded or stream.thread == thread:
+            return node.put
+        inbox = self._inboxes.setdefault(thread, _Inbox(self))
+        drops = self.drops or bool(stream.depth)
+        return inbox.reader(node, stream.depth or node.depth or self._depth, drops=drops)
 
     # The run.
 
@@ -325,6 +350,7 @@ class Graph:
         Raises the first error of any stage with later ones in its notes.
         """
         # 1. A thread for each source and each group of stages.
+        self.connect()
         bodies = self._sources | {name: inbox.serve for name, inbox in self._inboxes.items()}
         threads = [threading.Thread(target=self._begin, args=body, name=body[0]) for body in bodies.items()]
         if not self.threaded:

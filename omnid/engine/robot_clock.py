@@ -7,11 +7,12 @@ recordings a stamp s is the Unix time
     unix(s) = s + offset(s)
 
 with the offset that was in force at s, so a stamp has one Unix time in however many messages it is sent. A change of
-the offset by more than STEP_NS is a step, which is reported. Smaller changes are followed in silence.
+the offset by more than STEP_NS is a step, which is logged. Smaller changes are followed in silence.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections import deque
@@ -19,7 +20,8 @@ from collections.abc import Callable
 from typing import Final
 
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
-from omnid.engine.graph import Lock, no_op
+from omnid.engine.graph import Lock
+from omnid.engine.logging_setup import log
 
 STEP_NS: Final = 1_000_000  # less than two images of a pair are apart, more than NTP slews in a second
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
@@ -32,17 +34,16 @@ class RobotClock:
         self,
         monotonic_ns: Callable[[], int] = time.monotonic_ns,
         unix_ns: Callable[[], int] = lambda: time.time_ns(),
-        report: Callable[[str], object] = no_op,
     ) -> None:
-        """monotonic_ns: the clock of the stamps. unix_ns: the clock that may be set. report: takes a line at a step."""
-        self.monotonic_ns, self._unix_ns, self._report = monotonic_ns, unix_ns, report
+        """monotonic_ns: the clock of the stamps. unix_ns: the clock that may be set."""
+        self.monotonic_ns, self._unix_ns = monotonic_ns, unix_ns
         self._following = Lock()
         # Stamps from which on an offset is in force [ns], with the offset.
         self._offsets = deque[tuple[float, int]]([(-math.inf, self._measured()[1])], KEPT)
         self.steps, self._step_at_ns = 0, 0
 
     def follow(self) -> None:
-        """Measure the offset, follow it, and report a step; without a step at most once a second."""
+        """Measure the offset, follow it, and log a step; without a step at most once a second."""
         with self._following:
             error_ns, offset_ns, now_ns = self._measured()
             since_ns, before_ns = self._offsets[-1]
@@ -54,7 +55,7 @@ class RobotClock:
                 return
             self.steps, self._step_at_ns = self.steps + 1, now_ns
         how = f"was set {'forwards' if change_ns > 0 else 'back'} by {abs(change_ns) * S_PER_NS:.3f} s"
-        self._report(f"the computer's clock {how}: stamps follow it, a recording goes on in a new file")
+        log(logging.WARNING, f"the computer's clock {how}: stamps follow it, a recording goes on in a new file")
 
     def _measured(self) -> tuple[int, int, int]:
         """Return the largest error of an offset, the offset, and the time of both [ns]; of three the most exact one.

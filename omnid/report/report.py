@@ -19,7 +19,7 @@ from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.page import Array, Curve, chart, colours, embedded, facts, grid, note, page, style_and_script, table
 from omnid.report.recorded_run import LEVELS, STATES, UNKNOWN, Event, RecordedRun
 from omnid.transport import status_names
-from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, STAGE_PREFIX, WORK, Key, short_name, time_key
+from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, STAGE_PREFIX, WORK, Key, short_name
 from omnid.version import __version__
 
 
@@ -195,12 +195,12 @@ def _sections(run: RecordedRun, true: Trajectory | None) -> Iterator[tuple[str, 
     stages = {name.removeprefix(STAGE_PREFIX): run.values(name) for name in run.newest if name.startswith(STAGE_PREFIX)}
     rows = []
     for name, values in stages.items():
-        times = (_rounded(values.get(time_key(WORK, statistic), "")) for statistic in ("p50", "p99", "max"))
+        times = (_rounded(values.get(f"{WORK}_{statistic}_ms", "")) for statistic in ("p50", "p99", "max"))
         counts = (values.get(key, "") for key in (Key.PROCESSED, Key.RATE_HZ, Key.DROPPED))
         rows.append((name, *counts, *times))
     titles = ("stage", "messages", "per second, last", "dropped", "p50 ms", "p99 ms", "max ms")
     latency = {"median": "p50", "99th percentile": "p99"}
-    curves = [run.curve(name, ODOMETRY, time_key(CAPTURE_TO_POSE, p)) for name, p in latency.items()]
+    curves = [run.curve(name, ODOMETRY, f"{CAPTURE_TO_POSE}_{p}_ms") for name, p in latency.items()]
     figures = [
         chart("Poses per second", [run.curve("", ODOMETRY, Key.RATE_HZ)]),
         chart("From the image to its pose", curves, "ms", note="Of all messages since the start of the run."),

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from calib.rig_file import rig_toml
 from omnid.config import Config
@@ -18,6 +19,7 @@ from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import TaughtRoute
 from omnid.core.navigation.route import Route
 from omnid.core.places.place_map import PlaceMap, PlaceRig
+from omnid.engine.graph import Stream
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
@@ -28,6 +30,13 @@ from omnid.stages.geometry import Geometry
 from omnid.transport.topics import MAX_OPEN, Answer, Answers
 
 
+class MapCopy(NamedTuple):
+    """A copy of the map, to be written."""
+
+    places: PlaceMap
+    request_ids: tuple[int, ...]  # of the requests that it answers
+
+
 class RunPlaces:
     """Holds the map that a run localises in; `places` is None where the run has no map but its own.
 
@@ -35,11 +44,10 @@ class RunPlaces:
     thread of the files, so that a robot that is switched off loses little. `written` is the file, once it was written.
     """
 
-    def __init__(self, config: Config, geometry: Geometry, warn: Callable[[str], None], *, saves: bool = False) -> None:
+    def __init__(self, config: Config, geometry: Geometry, warn: Callable[[str], None]) -> None:
         """Read the file places.map. One that does not exist is made by this run, unless it only localises.
 
-        warn: takes a line for the user. saves: the map is written on request and each places.save_s, too; else at the
-        end only.
+        warn: takes a line for the user.
 
         Raises OmnidError for a file that is no map, or that of another rig.
         """
@@ -50,12 +58,11 @@ class RunPlaces:
             raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")
         # 1. The map: that of the file, a new one, or none. It must fit the rig, and the panoramas of this run.
         path = self._path = Path(settings.map)
-        self._is_extended = bool(settings.map) and not settings.localize_only  # the file is written
-        self.saves = saves and self._is_extended
+        self.is_extended = bool(settings.map) and not settings.localize_only  # the file is written
         self.places = PlaceMap(settings.limits.max_keyframes) if settings.map else None
-        if self._is_extended:
+        if self.is_extended:
             check_outputs([("--map", path)], [])
-        if self._is_extended and not path.exists():
+        if self.is_extended and not path.exists():
             log(logging.INFO, f"{path.name}: there is no such map: this run begins a new one")
         elif self.places is not None:
             self.places, rig = read_places(path)
@@ -70,38 +77,35 @@ class RunPlaces:
         self.is_new = not self._loaded_ids
         # 2. Saves, and requests for them.
         self.written: Path | None = None
-        self._request_ids: deque[int] = deque(maxlen=MAX_OPEN)  # to be answered by the next write
-        self._is_requested = False  # since the newest copy
+        self._request_ids = deque[int](maxlen=MAX_OPEN)  # since the newest copy
         self._save_ns, self._copied_ns = round(settings.save_s * NS_PER_S), 0
         self._saved = frozenset[int]()  # keyframes in the file
         self._saves, self._error = 0, ""  # number of saves; error of the last one
 
-    def ask(self, id: int) -> None:
-        """Have the map written, and the request with this id answered; from any thread."""
-        self._request_ids.append(id)
-        self._is_requested = True
-
-    def copy(self, update: PlaceUpdate) -> PlaceMap | None:
-        """Return a copy of the map after a pose, where it is due or was asked for."""
-        self._copied_ns = self._copied_ns or update.stamp_ns
-        is_due = self._is_requested or update.stamp_ns - self._copied_ns >= self._save_ns
-        if self.places is None or not is_due:
+    def copy(self, message: PlaceUpdate | int) -> MapCopy | None:
+        """Return a copy of the map after a pose, where it is due, or after a request for it, of which the id comes."""
+        if isinstance(message, int):
+            self._request_ids.append(message)
             return None
-        self._is_requested, self._copied_ns = False, update.stamp_ns
-        return self.places.part(self.places.keyframes)
+        stamp_ns, ids = message.stamp_ns, tuple(self._request_ids)
+        self._copied_ns = self._copied_ns or stamp_ns
+        if self.places is None or not (ids or stamp_ns - self._copied_ns >= self._save_ns):
+            return None
+        self._request_ids.clear()
+        self._copied_ns = stamp_ns
+        return MapCopy(self.places.part(self.places.keyframes), ids)
 
-    def write(self, places: PlaceMap) -> Answers:
-        """Write the joined part of a copy, where it is new; return the answers to the requests so far."""
-        ids = [self._request_ids.popleft() for _ in range(len(self._request_ids))]
-        joined = self._joined(places)
+    def write(self, copy: MapCopy) -> Answers:
+        """Write the joined part of a copy, where it is new; return the answers to its requests."""
+        joined = self._joined(copy.places)
         answer, self._error = Answer(True, "the map in the file has all that is known already"), ""
         if joined - self._loaded_ids and joined != self._saved:
             try:
-                self._write(places.part(joined))
+                self._write(copy.places.part(joined))
                 self._saved, self._saves, answer = joined, self._saves + 1, Answer(True, "the map is saved")
             except OmnidError as error:
                 self._error, answer = str(error), Answer(False, f"the map is not saved: {error}")
-        return dict.fromkeys(ids, answer)
+        return dict.fromkeys(copy.request_ids, answer)
 
     def stats(self) -> dict[str, object]:
         """Return how often the map was saved, and why it is not."""
@@ -120,9 +124,9 @@ class RunPlaces:
             self._warn(f"{self._path}: no place of it was recognised: nothing was added to it")
         elif unjoined:
             self._warn(f"{self._path}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
-        if self._is_extended and new:
+        if self.is_extended and new:
             self._write(self.places.part(joined))
-        elif self._is_extended and not self._loaded_ids:
+        elif self.is_extended and not self._loaded_ids:
             self._warn(f"{self._path}: no keyframe was found: no map was written")
 
     def _write(self, places: PlaceMap) -> None:
@@ -147,9 +151,9 @@ def place_rig(geometry: Geometry) -> PlaceRig:
 class RouteFiles:
     """The routes of a run: read at its start, written in the thread of the files once they are taught."""
 
-    def __init__(self, folder: RouteFolder, run_map: RunPlaces) -> None:
-        """Read all routes; a damaged file is reported. run_map: is saved with each route, which refers to it."""
-        self._folder, self._run_map = folder, run_map
+    def __init__(self, folder: RouteFolder, saves: Stream[int] | None = None) -> None:
+        """Read all routes; a damaged file is reported. saves: takes requests to save the map that routes refer to."""
+        self._folder, self._saves = folder, saves
         self._written: TaughtRoute | None = None
         self.routes: dict[str, Route] = {}
         for name in folder.names():
@@ -168,6 +172,6 @@ class RouteFiles:
             self._folder.write(taught.route)
         except OmnidError as error:
             return {taught.id: Answer(False, f"{error}; finish it again once that is mended")}
-        if self._run_map.saves:
-            self._run_map.ask(taught.id)
+        if self._saves is not None:
+            self._saves.push(taught.id)
         return {taught.id: Answer(True, "the route is written")}

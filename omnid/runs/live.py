@@ -11,13 +11,12 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Final, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
@@ -25,43 +24,32 @@ from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.logs.mcap_writer import RotatingLog
 from omnid.config import Config
-from omnid.controller.ipc import ARMED, ControllerState
+from omnid.controller.ipc import ARMED
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import MANUAL
-from omnid.core.control.safety_rules import AWAITED
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import RunStatistics, StatusCollector, image_stats, rig_stats, wheel_stats
 from omnid.engine.graph import Graph, StageStats, Stream
-from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER, log
 from omnid.engine.process import prepare, start_thread
-from omnid.engine.robot_clock import RobotClock, fixed_offset
+from omnid.engine.robot_clock import RobotClock
 from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.plain_text import one_line
 from omnid.runs.files import RunPlaces
-from omnid.runs.wiring import RECORDED_DEPTH, Inputs, Outputs, Session, run_to_end, wire
+from omnid.runs.wiring import BACKGROUND, BUS, Inputs, Session, run_to_end, wire
 from omnid.settings import dump
 from omnid.sinks.encoder import BusSink, Encoder, PanoramaSink
 from omnid.sinks.recorder import Recorder
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.obstacles import FLOOR_WARNING, controller_scan
+from omnid.stages.obstacles import FLOOR_WARNING
 from omnid.stages.synchronise import MotionInbox
 from omnid.transport import status_names as names
 from omnid.transport import topics
-from omnid.transport.bus import Bus
 from omnid.transport.codec import Diagnostics, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.sensor_codec import sample_from_cdr
-from omnid.transport.topics import Answer, Answers
 
-NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
-NO_SAMPLES: Final = "it is not used, see motion.wheels and motion.imu"
-NO_MAP_FILE: Final = (
-    "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
-    "without --localize-only"
-)
+RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
 
 
 class LiveCamera(FrameSource, Protocol):
@@ -79,9 +67,7 @@ class LiveRobot(Protocol):
     waits: bool  # its time is stopped until the run has answered: nothing is dropped or omitted under load
     brings_samples: bool  # wheels and gyro come with the images, or not at all: no others fit them
     states: Mapping[Camera, CameraState]  # of the cameras, once they are open
-
-    def clock_ns(self) -> int:
-        """Return the time, by the clock of the stamps of images, poses and ticks [ns]."""
+    clock: RobotClock  # of the stamps of images, poses and ticks
 
     def connect(self, session: Session, motion: MotionInbox, /) -> tuple[list[Stream[Frame]], DriveLink | None]:
         """Open the cameras and start the controller; return the sources of the images, and None without wheels.
@@ -99,10 +85,7 @@ class ConnectedRobot:
         """plays_log: the images are those of a log, and samples of wheels and gyro are not used."""
         self._open_camera, self.brings_samples = open_camera, plays_log
         self.states: Mapping[Camera, CameraState] = {}
-
-    def clock_ns(self) -> int:
-        """Return CLOCK_MONOTONIC."""
-        return time.monotonic_ns()
+        self.clock = RobotClock()
 
     def connect(self, session: Session, _: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink | None]:
         """Open the cameras, and start the controller process where there is a motor."""
@@ -113,8 +96,8 @@ class ConnectedRobot:
         return frames, session.start_controller() if session.config.motor.port else None
 
 
-def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> RobotClock:
-    """Run the daemon until a signal comes, or the cameras end; return its clock. rig: None for that of the settings."""
+def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> None:
+    """Run the daemon until a signal comes, or the cameras end. rig: None for that of the settings."""
     with suppress(OSError, ValueError):  # stderr is no file
         faulthandler.enable()  # the watchdog of systemd sends SIGABRT: the stacks of all threads are printed
 
@@ -123,23 +106,21 @@ def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> RobotC
         log(logging.INFO if was_asked else logging.WARNING, line)
 
     if robot.waits:  # Its time waits for the stages, so that nothing is dropped.
-        graph, clock = Graph(on_thread=partial(start_thread, {}, log)), fixed_offset(robot.clock_ns)
+        graph = Graph(on_thread=partial(start_thread, {}, log))
     else:
         priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
         graph = Graph(drops=True, depth=1, on_thread=partial(start_thread, priorities, log))
-        clock = RobotClock(robot.clock_ns, report=warn)
     with ExitStack() as outputs:
-        session = Session(config, graph, outputs, warn, clock)
+        session = Session(config, graph, outputs, warn, robot.clock)
         # 1. The rig, and what is compiled or imported before the first image.
         geometry = session.geometry(rig or read_rig(Path(config.cameras.rig)), ())
         published = (topic.schema for topic in topics.PUBLISHED.values())
         compile_serialisers([*published, *(command.schema for command in topics.COMMANDS.values())])
-        prepare_kernels()
+        front_end = FrontEnd(geometry, config, RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s))
         import_module("scipy.sparse.linalg")  # needed by the first loop closure
         outputs.enter_context(graph.signals())
         # 2. The connections, and the stages between them.
-        health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
-        run_places = _connect(session, FrontEnd(geometry, config, health), robot)
+        run_places = _connect(session, front_end, robot)
         if geometry.rig.height_m(config.obstacles.scan.floor_m) is None:
             warn(FLOOR_WARNING)
         # 3. The status line of systemd and of a terminal.
@@ -155,7 +136,6 @@ def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> RobotC
         if not robot.waits:
             prepare()
         run_to_end(graph, run_places)
-    return clock
 
 
 def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlaces:
@@ -166,77 +146,64 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     # 1. Cameras and wheels, the bus, the map of places.
     frames, controller = robot.connect(session, motion)
     bus = session.open_bus(rig, gives_time=robot.waits)
-    run_places = RunPlaces(config, front_end.geometry, session.warn, saves=True)
+    run_places = RunPlaces(config, front_end.geometry, session.warn)
 
-    def answer(answers: Answers) -> None:
-        for id, words in answers.items():
-            bus.answer(id, words)
-
-    # 2. The sinks.
-    reports = graph.inlet(1)  # the status
-    exposure = ExposureControl(UsefulArea(rig, front_end.geometry.cylinder), config.cameras, robot.states)
-    outputs = Outputs(
-        pairs={"exposure": exposure},
-        counters={"statistics": statistics},
-        answers=answer,
-        bus=BusSink(bus, session.encoder(rig), gives_time=robot.waits),
-    )
-    if config.record.enabled:
-        recorder = open_recorder(config, rig_toml(rig), clock, session.encoder(rig, clock.segment_unix_ns))
-        session.outputs.callback(recorder.close)
-        session.parts[names.RECORDING] = recorder.stats
-        outputs = replace(outputs, recorder=recorder)
-    if config.bus.panorama_hz:
-        outputs.poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns)
-    outputs.poses["rig"] = lambda pose: health.check_drive(
-        pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure
-    )
-
-    # 3. The stages. Samples of gyro and wheels come from the bus, unless they come with the images of a log or of a
+    # 2. The stages. Samples of gyro and wheels come from the bus, unless they come with the images of a log or of a
     #    simulation, whose motion others would not fit; a motor controller gives those of its wheels.
-    is_subscribed = {
-        topics.IMU: config.motion.imu != "off" and not robot.brings_samples,
-        topics.WHEEL_ODOM: config.motion.wheels != "off" and not robot.brings_samples,
-    }
+    used = {topics.IMU: config.motion.imu, topics.WHEEL_ODOM: config.motion.wheels}
+    subscribed = {topic for topic, setting in used.items() if setting != "off" and not robot.brings_samples}
+    samples = graph.inlet(1, thread="bus commands")
+    graph.sink("samples", motion.add, samples, thread=samples.thread)
     navigation = None
     if controller is not None and config.controller.collision.check and not config.obstacles.enabled:
         session.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from obstacles")
     if controller is not None:
-        outputs.scans["controller-scan"] = lambda scan: controller.send(controller_scan(scan))
         states = controller.statistics.states = graph.inlet(1, thread="drive")
-        graph.sink("arming", partial(_answer_arming, bus), states, thread=states.thread)
-        if is_subscribed.pop(topics.WHEEL_ODOM):
+        if topics.WHEEL_ODOM in subscribed:
+            subscribed.discard(topics.WHEEL_ODOM)
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         navigation = graph.inlet(topics.MAX_OPEN), states
-    inputs = Inputs(frames, run_places, controller, navigation, reports, config.live.cloud_s)
-    places = wire(config, inputs, front_end, graph, outputs)
+    saves = graph.inlet(topics.MAX_OPEN) if run_places.is_extended else None
+    reports = graph.inlet(1)  # the status
+    inputs = Inputs(frames, run_places, controller, navigation, saves, reports, config.live.cloud_s)
+    streams = wire(config, inputs, front_end, graph)
+    pairs, poses = streams.pairs, streams.poses
 
-    # 4. Commands and requests from the bus; without a motor all but those to save the map are refused.
-    def add_sample(topic: str, payload: bytes) -> None:
-        motion.add(sample_from_cdr(payload, topics.COMMANDS[topic].schema, clock.stamp_ns))
+    # 3. The sinks.
+    exposure = ExposureControl(UsefulArea(rig, front_end.geometry.cylinder), config.cameras, robot.states)
+    graph.sink("statistics", statistics, poses, thread=poses.thread)
+    graph.sink("exposure", exposure, pairs, thread=BACKGROUND)
+    graph.sink(
+        "rig",
+        lambda pose: health.check_drive(pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure),
+        poses,
+        thread=BACKGROUND,
+    )
+    streams.publish(graph, BusSink(bus, session.encoder(rig), gives_time=robot.waits))
+    if config.bus.panorama_hz:
+        graph.sink("panorama", PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns), poses, thread=BACKGROUND)
+    if config.record.enabled:
+        recorder = open_recorder(config, rig_toml(rig), clock, session.encoder(rig, clock.segment_unix_ns))
+        session.outputs.callback(recorder.close)
+        session.parts[names.RECORDING] = recorder.stats
+        images: Sequence[Stream[Any]] = [pairs] if config.record.images_hz else frames
+        leaving = (one.stream for one in streams.leaving)
+        graph.sink("record", recorder, *images, *leaving, depth=RECORDED_DEPTH)
+    graph.sink("answer", bus.answer, *streams.answers, thread=BUS, depth=topics.MAX_OPEN)
+    graph.connect()
 
-    def ask(command: NavigationCommand) -> None:
-        if navigation is not None and controller is not None:
-            navigation[0].push(command._replace(stop_count=controller.statistics.state.stop_count))
-
-    def is_stopped() -> bool:
-        return controller is not None and controller.statistics.state.disarmed_by == names.DISARMED_BY_STOP
-
+    # 4. Commands, requests and samples from the bus.
     freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))
     bus.serve(topics.TIME, freshness.own_time)
+    requests = None if navigation is None else navigation[0]
     commands = CommandReceiver(
-        freshness,
-        controller=controller,
-        is_unique=lambda: bus.is_unique,
-        navigate=ask if controller is not None else None,
-        save_map=run_places.ask if run_places.saves else None,
-        sensors={topic: partial(add_sample, topic) for topic, is_on in is_subscribed.items() if is_on},
-        why_not=dict.fromkeys(topics.COMMANDS, NO_MOTOR)
-        | {topics.MAP: NO_MAP_FILE, **dict.fromkeys(topics.SENSOR_TOPICS, NO_SAMPLES)},
-        report=session.warn,
+        freshness, controller=controller, navigation=requests, saves=saves, samples=dict.fromkeys(subscribed, samples)
     )
-    bus.subscribe_commands(commands.receive, is_stopped)
+    bus.subscribe_commands(
+        commands.receive,
+        lambda: controller is not None and controller.statistics.state.disarmed_by == names.DISARMED_BY_STOP,
+    )
 
     # 5. The status of all parts.
     session.parts |= {
@@ -249,9 +216,9 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     }
     if controller is not None:
         session.parts[names.WHEELS] = partial(wheel_stats, controller.statistics, commands)
-    if places is not None:
-        session.parts[names.PLACES] = places.stats
-    if run_places.saves:
+    if streams.places is not None:
+        session.parts[names.PLACES] = streams.places.stats
+    if saves is not None:
         session.parts[names.MAP_FILE] = run_places.stats
     collect = StatusCollector(
         graph.stats, robot.states, front_end.pairing, statistics, session.parts, clock.monotonic_ns
@@ -262,15 +229,6 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
         "status",
     )
     return run_places
-
-
-def _answer_arming(bus: Bus, state: ControllerState) -> None:
-    """Answer the newest request to arm."""
-    answer = state.arm_answer
-    text = answer.refusal or "armed: it obeys commands from now on"
-    if answer.refusal == AWAITED:
-        text = f"{AWAITED}: {state.problem}"
-    bus.answer(answer.id, Answer(not answer.refusal, text))
 
 
 def open_recorder(config: Config, rig: str, clock: RobotClock, encode: Encoder | None = None) -> Recorder:
@@ -289,7 +247,7 @@ def open_recorder(config: Config, rig: str, clock: RobotClock, encode: Encoder |
 
 def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: str) -> Recorder:
     """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
-    clock = RobotClock(report=partial(log, logging.WARNING))
+    clock = RobotClock()
     graph = Graph(drops=True, depth=RECORDED_DEPTH)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
     recorder = open_recorder(config, rig, clock)

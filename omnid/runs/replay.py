@@ -6,11 +6,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,6 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.status import RunCounters, RunStatistics, input_warnings, pair_loss
 from omnid.engine.graph import POLL_S, Graph, Sink, sleep_until
-from omnid.engine.kernel_cache import prepare_kernels
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
@@ -34,7 +34,7 @@ from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import MapUpdate, PlaceUpdate
 from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.files import RunPlaces
-from omnid.runs.wiring import Inputs, Outputs, Session, attached_rig, run_to_end, wire
+from omnid.runs.wiring import BACKGROUND, Inputs, Session, attached_rig, run_to_end, wire
 from omnid.settings import dump
 from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import BusSink, Outgoing
@@ -76,15 +76,6 @@ class ReplayOptions:
         """The files that are written, each with its option."""
         names = ("tum", "map_tum", "cloud", "plan", "record")
         return [(f"--{name.replace('_', '-')}", path) for name in names if (path := getattr(self, name)) is not None]
-
-
-class CollectedPose(NamedTuple):
-    """A pose that is kept for the result, see RunResult."""
-
-    stamp_ns: int
-    T_odom_rig: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    state: TrackingState
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -179,57 +170,61 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         reader = LogReader(log, cameras, topics, span_s=options.span_s, motion=motion)
         closing.callback(reader.close)
         geometry = session.geometry(given_rig or attached_rig(reader, log), reader.frames())
-        prepare_kernels()
         front_end = FrontEnd(geometry, config)
         run_places = RunPlaces(config, geometry, session.warn)
 
-        # 3. The outputs; one that cannot be opened ends the run before it begins. A pose that is kept, with its
+        # 3. The stages.
+        paced = partial(_paced, reader, graph)
+        messages = graph.source("read", paced if options.paced else reader.messages)
+        inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
+        streams = wire(config, inputs, front_end, graph)
+        poses, maps = streams.poses, streams.maps
+
+        # 4. The outputs; one that cannot be opened ends the run before it begins. A pose that is kept, with its
         #    covariance, takes 0.7 kB: 75 MB an hour at 30 Hz.
-        poses = list[CollectedPose]()
+        collected, kept = list[tuple[Any, ...]](), attrgetter("stamp_ns", "T_odom_rig", "covariance", "state")
         updates, newest_map = list[PlaceUpdate](), deque[MapUpdate](maxlen=1)
         rig = geometry.rig
         recorder: Recorder | None = None
         wheels: ReplayDrive | None = None
-        bus: BusSink | None = None
-        outputs = Outputs(counters={"statistics": session.statistics})
+        graph.sink("statistics", session.statistics, poses, thread=poses.thread)
         if options.collect:
-            outputs.poses["collect-poses"] = lambda pose: poses.append(
-                CollectedPose(pose.stamp_ns, pose.T_odom_rig, pose.covariance, TrackingState(pose.state))
-            )
-            outputs.maps["collect-map"] = newest_map.append
+            graph.sink("collect-poses", lambda pose: collected.append(kept(pose)), poses, thread=BACKGROUND)
+            graph.sink("collect-map", newest_map.append, maps, thread=BACKGROUND)
         if options.tum:
-            outputs.poses["trajectory"] = TrajectoryFile(options.tum)
-        if options.map_tum or options.collect:
-            outputs.places["collect-places"] = updates.append
+            graph.sink("trajectory", TrajectoryFile(options.tum), poses, thread=BACKGROUND)
+        if streams.in_map is not None and (options.map_tum or options.collect):
+            graph.sink("collect-places", updates.append, streams.in_map, thread=BACKGROUND)
         if cloud := options.cloud:  # each map replaces the file
-            outputs.maps["map"] = lambda update: write_ply(cloud, update.points)
+            graph.sink("map", lambda update: write_ply(cloud, update.points), maps, thread=BACKGROUND)
         if plan := options.plan:
             heights_m = drawn_heights(rig.height_m(config.obstacles.scan.floor_m) or 0.0)
-            outputs.maps["plan"] = lambda update: write_plan(plan, update.points, update.path_xy, heights_m)
+            graph.sink(
+                "plan", lambda now: write_plan(plan, now.points, now.path_xy, heights_m), maps, thread=BACKGROUND
+            )
+        if config.motor.port:
+            controller = session.start_controller(of_replay=True)
+            wheels = ReplayDrive(controller, config.controller.setpoint.setpoint(), rig.T_base_rig, front_end.health)
+            graph.sink("controller", wheels, poses, thread=poses.thread)
+        if options.publish:
+            bus = session.open_bus(rig, gives_time=True)
+            streams.publish(graph, BusSink(bus, session.encoder(rig), gives_time=True))
         if options.record:
             attachments = {"rig.toml": rig_toml(rig).encode(), "omnid.toml": dump(config).encode()}
             recorder = Recorder(SingleLog(options.record, attachments), config.bus.robot, session.encoder(rig))
             closing.callback(recorder.close)
-        if config.motor.port:
-            controller = session.start_controller(of_replay=True)
-            wheels = ReplayDrive(controller, config.controller.setpoint.setpoint(), rig.T_base_rig, front_end.health)
-            outputs.counters["controller"] = wheels
-        if options.publish:
-            bus = BusSink(session.open_bus(rig, gives_time=True), session.encoder(rig), gives_time=True)
-        outputs = replace(outputs, bus=bus, recorder=options.observer(front_end) if options.observer else recorder)
-        paced = partial(_paced, reader, graph)
-        messages = graph.source("read", paced if options.paced else reader.messages)
-        inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
-        places = wire(config, inputs, front_end, graph, outputs)
+        if observer := options.observer(front_end) if options.observer else recorder:
+            graph.sink("record", observer, *(one.stream for one in streams.leaving))
         if options.progress is not None:
             show = partial(options.progress, session.statistics, reader.pair_estimate())
             closing.callback(show, True)
             session.every(POLL_S, partial(show, False), "progress")
 
-        # 4. The run, and its counters.
+        # 5. The run, and its counters.
         begun_s = time.monotonic()
         with graph.signals():
             run_to_end(graph, run_places)
+        places = streams.places if "places" in graph.stats else None  # they have a reader
         found, read, paired = session.statistics, reader.counts, front_end.pairing.stats()
         # Losses by reason, zeros too.
         drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
@@ -249,7 +244,9 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         if recorder is not None:
             recorder.close()
 
-        # 5. Poses in the map: corrected by its later loops, and as they were known while driving.
+        kept_stamps_ns, kept_poses, kept_covariances, kept_states = tuple(zip(*collected, strict=True)) or 4 * ((),)
+
+        # 6. Poses in the map: corrected by its later loops, and as they were known while driving.
         corrected = [] if places is None else [places.corrected(each) for each in updates]
         in_map = np.array(corrected, float).reshape(-1, 4, 4)
         live = np.array([each.T_map_rig for each in updates], float).reshape(-1, 4, 4)
@@ -257,10 +254,10 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
             warnings += write_trajectory(options.map_tum, stamps_ns, in_map, places.known(updates))
         return RunResult(
-            np.array([pose.stamp_ns for pose in poses], np.int64),
-            np.array([pose.T_odom_rig for pose in poses], np.float64).reshape(-1, 4, 4),
-            np.array([pose.covariance for pose in poses], np.float64).reshape(-1, 6, 6),
-            tuple(pose.state for pose in poses),
+            np.array(kept_stamps_ns, np.int64),
+            np.array(kept_poses, np.float64).reshape(-1, 4, 4),
+            np.array(kept_covariances, np.float64).reshape(-1, 6, 6),
+            tuple(kept_states),
             counters,
             {
                 name: {"n": one.processed, "drops": one.dropped, **one.wall.times_ms()}

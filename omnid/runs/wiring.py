@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 
@@ -27,11 +27,18 @@ from omnid.engine.graph import Graph, Output, Poller, Stream, run_in_thread
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
+from omnid.messages import (
+    FramePair,
+    MapUpdate,
+    NavigationUpdate,
+    ObstacleScan,
+    OdometryUpdate,
+    PlaceUpdate,
+)
 from omnid.runs.files import RouteFiles, RunPlaces
 from omnid.settings import dump
-from omnid.sinks.drive import LiveDrive, navigation_answers, send_setpoint
-from omnid.sinks.encoder import Encoder, Outgoing, UnixTime
+from omnid.sinks.drive import LiveDrive, arming_answers, navigation_answers, send_scan, send_setpoint
+from omnid.sinks.encoder import Encoder, UnixTime
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.mapping import MapGrid, Mapping, Places
@@ -46,7 +53,6 @@ BUS_S: Final = 3.0  # Time until a bus must be closed.
 CLOUD_POINTS: Final = 50_000  # Most points of the map in one message.
 
 BUS, FILES, BACKGROUND = "bus", "files", "background"  # threads that several stages and sinks share
-RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
 
 
 def attached_rig(reader: LogReader, log: object) -> Rig:
@@ -154,28 +160,41 @@ class Inputs:
     controller: DriveLink | None = None  # of a live run; its commands leave the run
     # Requests to the navigation, and the states of the controller; None: the run does not navigate.
     navigation: tuple[Stream[NavigationCommand], Stream[ControllerState]] | None = None
-    reports: Stream[Diagnostics] | None = None  # the status of a live run, whose images are recorded as well
+    saves: Stream[int] | None = None  # ids of requests to save the map; None: it is saved at the end only
+    reports: Stream[Diagnostics] | None = None  # the status of a live run
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
 
+class Leaving(NamedTuple):
+    """A stream of messages that leave the run: what they are about, and the thread in which they are published."""
+
+    about: str
+    stream: Stream[Any]
+    thread: str = BUS
+
+
 @dataclass(frozen=True, slots=True)
-class Outputs:
-    """The consumers of a run; a map without a consumer is not computed, nor are places."""
+class Streams:
+    """The results of a run, for its sinks; what nobody reads is not computed. None: the run has none."""
 
-    pairs: dict[str, Output[FramePair]] = field(default_factory=dict)
-    poses: dict[str, Output[OdometryUpdate]] = field(default_factory=dict)
-    counters: dict[str, Output[OdometryUpdate]] = field(default_factory=dict)  # in the thread of the poses: never wait
-    maps: dict[str, Output[MapUpdate]] = field(default_factory=dict)
-    places: dict[str, Output[PlaceUpdate]] = field(default_factory=dict)
-    scans: dict[str, Output[ObstacleScan]] = field(default_factory=dict)  # in the thread of the scans
-    ways: dict[str, Output[NavigationUpdate]] = field(default_factory=dict)  # in the thread of the navigation
-    answers: Output[Answers] | None = None  # to requests
-    bus: Output[Outgoing] | None = None  # takes all messages that leave the run
-    recorder: Output[Any] | None = None  # takes them as well
+    pairs: Stream[FramePair]
+    poses: Stream[OdometryUpdate]
+    maps: Stream[MapUpdate]
+    in_map: Stream[PlaceUpdate] | None
+    scans: Stream[ObstacleScan] | None
+    ways: Stream[NavigationUpdate] | None
+    leaving: Sequence[Leaving]
+    answers: Sequence[Stream[Answers]]  # to requests
+    places: Places | None  # the stage of `in_map`
+
+    def publish(self, graph: Graph, sink: Output[Any]) -> None:
+        """Have all messages that leave the run published."""
+        for about, stream, thread in self.leaving:
+            graph.sink(f"bus-{about}", sink, stream, thread=thread)
 
 
-def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outputs: Outputs) -> Places | None:
-    """Join the stages to the inputs and to the outputs; return the places, if they are wired.
+def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> Streams:
+    """Join the stages to the inputs; return their results.
 
     Where inboxes drop, one thread makes a pose of the newest images, so that old images are dropped before any work.
     Else decoding and dewarping are one bounded inbox ahead of the odometry. Places, obstacles and navigation have a
@@ -184,93 +203,59 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     geometry, run_map, controller = front_end.geometry, inputs.map, inputs.controller
     T_base_rig = geometry.rig.T_base_rig
     T_base_rect = T_base_rig @ geometry.T_rig_rect
-    has_outgoing = outputs.bus is not None or outputs.recorder is not None
-    places, obstacles = None, None
-    commands, maps, in_map, grids, scans, ways = None, None, None, None, None, None
+    places, in_map, scans, ways = None, None, None, None
+    answers: list[Stream[Answers]] = []
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *inputs.frames)
     panoramas = graph.stage("dewarp", front_end.dewarp, pairs, thread="pair")
     poses = graph.stage("odometry", front_end, panoramas, thread="pair" if graph.drops else "")
+    leaving = [Leaving("poses", poses)]
 
     # 2. Poses go to the controller, which waits for no stage.
     if controller is not None:
         graph.sink("controller", LiveDrive(controller, T_base_rig), poses, thread=poses.thread)
-        commands = graph.source("drive", controller.commands, wake=controller.end)
+        leaving.append(Leaving("drive", graph.source("drive", controller.commands, wake=controller.end)))
 
-    # 3. Poses give the map, the pose in it, and the obstacles, where these are consumed.
-    if outputs.maps or has_outgoing:
-        mapping = Mapping(config.mapping, front_end.dense, inputs.map_every_s, keyframes_only=graph.drops)
-        maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
-    if config.places.enabled and (outputs.places or has_outgoing or inputs.navigation or run_map.places is not None):
+    # 3. Poses give the map, the pose in it, and the obstacles. A map that is extended needs no reader.
+    mapping = Mapping(config.mapping, front_end.dense, inputs.map_every_s, keyframes_only=graph.drops)
+    maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
+    leaving.append(Leaving("map", maps, FILES))  # to encode a map takes longer than a pose may wait
+    if config.places.enabled:
         places = Places(geometry, config, front_end.dense, run_map.places)
-        in_map = graph.stage("places", places, poses)
-    if in_map is not None and has_outgoing:
+        in_map = (graph.stage if run_map.places is None else graph.sink)("places", places, poses)
         grid = MapGrid(config.mapping.voxel_m, T_base_rect, inputs.map_every_s)
         grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
-    if config.obstacles.enabled and (outputs.scans or has_outgoing or inputs.navigation):
-        obstacles = Obstacles(geometry, config.obstacles)
-        scans = graph.stage("obstacles", obstacles, poses)
+        leaving += [Leaving("places", in_map), Leaving("grid", grids, FILES)]
+    if config.obstacles.enabled:
+        scans = graph.stage("obstacles", Obstacles(geometry, config.obstacles), poses)
+        leaving.append(Leaving("scan", scans))
+        if controller is not None:
+            graph.sink("controller-scan", partial(send_scan, controller), scans, thread=scans.thread)
 
     # 4. All of them, and requests, give the way to drive. Routes and copies of the map are written by another thread.
-    answers: list[Stream[Answers]] = []
-    if in_map is not None and run_map.saves:
-        copies = graph.stage("map-copies", run_map.copy, in_map, thread=in_map.thread)
-        answers.append(graph.stage("save", run_map.write, copies, thread=FILES))
+    if in_map is not None and inputs.saves is not None:
+        asked: list[Stream[PlaceUpdate | int]] = [in_map, inputs.saves]
+        copies = graph.stage("map-copies", run_map.copy, *asked, thread=in_map.thread)
+        answers.append(graph.sink("save", run_map.write, copies, thread=FILES, depth=MAX_OPEN))
     if inputs.navigation is not None:
         requests, states = inputs.navigation
-        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), run_map)
+        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), inputs.saves)
         of_base = config.controller.collision, T_base_rig, T_base_rect
         map_name = config.places.map if places else ""
         stage = NavigationStage(config.navigation, *of_base, map_name, files.routes, is_new=run_map.is_new)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
-        streams: list[Stream[Any] | None] = [poses, in_map, scans, wheels, requests]
-        inbox = [stream for stream in streams if stream is not None]
-        ways = graph.stage("navigation", stage, *inbox)
+        inbox: list[Stream[Any] | None] = [poses, in_map, scans, wheels, requests]
+        ways = graph.stage("navigation", stage, *(stream for stream in inbox if stream is not None))
+        leaving.append(Leaving("navigation", ways))
+        answers.append(graph.stage("arming", arming_answers, states, thread=states.thread))
         answers.append(graph.stage("answers", navigation_answers, ways, thread=ways.thread))
-        answers.append(graph.stage("taught", files.write, ways, thread=FILES))
+        answers.append(graph.sink("taught", files.write, ways, thread=FILES))
         if controller is not None:
             graph.sink("planner-drive", partial(send_setpoint, controller), ways, thread=ways.thread)
-
-    # 5. Sinks of each stream: those of the run, then the bus and the recorder.
-    consumed: list[tuple[dict[str, Any], Stream[Any] | None, str]] = [
-        (outputs.counters, poses, poses.thread),
-        (outputs.pairs, pairs, BACKGROUND),
-        (outputs.scans, scans, "obstacles"),
-        (outputs.poses, poses, BACKGROUND),
-        (outputs.maps, maps, BACKGROUND),
-        (outputs.places, in_map, BACKGROUND),
-        (outputs.ways, ways, "navigation"),
-    ]
-    leaving: list[tuple[str, Stream[Any] | None, str]] = [
-        ("bus", poses, BUS),
-        ("bus-drive", commands, BUS),
-        ("bus-map", maps, FILES),  # to encode a map takes longer than a pose may wait
-        ("bus-places", in_map, BUS),
-        ("bus-grid", grids, FILES),
-        ("bus-scan", scans, BUS),
-        ("bus-navigation", ways, BUS),
-        ("bus-status", inputs.reports, BUS),
-    ]
-    if outputs.answers is not None:
-        graph.sink("answer", outputs.answers, *answers, thread=BUS, depth=MAX_OPEN)
-    if outputs.recorder is not None:
-        images: Sequence[Stream[Any]] = ()
-        if inputs.reports is not None:
-            images = (pairs,) if config.record.images_hz else inputs.frames
-        depth = RECORDED_DEPTH if inputs.reports is not None else 0
-        made = (stream for _, stream, _ in leaving if stream is not None)
-        graph.sink("record", outputs.recorder, *images, *made, depth=depth)
-    if outputs.bus is not None:
-        consumed += [({name: outputs.bus}, stream, thread) for name, stream, thread in leaving]
-    for sinks, stream, thread in consumed:
-        for name, sink in sinks.items():
-            if stream is not None:
-                graph.sink(name, sink, stream, thread=thread)
-
-    # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
-    graph.sink("keyframes", lambda _: front_end.complete(), poses, thread=poses.thread)
-    return places
+    if inputs.reports is not None:
+        leaving.append(Leaving("status", inputs.reports))
+    return Streams(pairs, poses, maps, in_map, scans, ways, leaving, answers, places)
 
 
 def wheel_state(state: ControllerState) -> WheelState:

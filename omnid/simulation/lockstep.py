@@ -25,11 +25,10 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
-from omnid.engine.graph import Graph, Output, no_op
-from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.graph import Graph, no_op
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.files import RunPlaces
-from omnid.runs.wiring import Inputs, Outputs, run_to_end, wire
+from omnid.runs.wiring import Inputs, run_to_end, wire
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER, controller_pose
@@ -124,7 +123,6 @@ def simulate(
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does. vehicle: makes the robot; `Vehicle`, or one with faults.
     """
-    prepare_kernels()
     # 1. The robot, and the lists of what it does.
     config, rig = config or Config(), robot.rig
     run, truth = SimulatedRun(rig.T_base_rig), dict[int, Array]()  # T_world_base by the stamp of a pair [ns]
@@ -197,10 +195,13 @@ def simulate(
     # 3. The run.
     run_places = RunPlaces(config, front_end.geometry, no_op)
     inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=(requests, states))
-    in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
-    outputs = Outputs(
-        poses={"poses": take_pose}, scans={"scans": take_scan}, places=in_map, ways={"planner": take_navigation}
-    )
-    wire(config, inputs, front_end, graph, outputs)
+    streams = wire(config, inputs, front_end, graph)
+    graph.sink("poses", take_pose, streams.poses)
+    if streams.scans is not None:
+        graph.sink("scans", take_scan, streams.scans)
+    if streams.in_map is not None and config.places.map:
+        graph.sink("in map", run.places.append, streams.in_map)
+    if streams.ways is not None:
+        graph.sink("planner", take_navigation, streams.ways)
     run_to_end(graph, run_places)
     return run

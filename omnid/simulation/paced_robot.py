@@ -24,6 +24,7 @@ from omnid.core.control.arming import NO_CONTACT, ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.graph import StageStats, Stream, no_op, sleep_until
+from omnid.engine.robot_clock import fixed_offset
 from omnid.runs.wiring import Session
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
@@ -51,6 +52,8 @@ class PacedRobot:
             lambda _, line: self._report(line),
             self._start_ns,
         )
+        # The simulated time begins with that of the computer, and never runs ahead of it.
+        self.clock = fixed_offset(lambda: self._vehicle.now_ns)
         self._ticks = StageStats()
         self.statistics = ControllerStatistics(self._ticks)
         self._commands: SimpleQueue[VelocityCommand | None] = SimpleQueue()  # None: the end
@@ -61,10 +64,6 @@ class PacedRobot:
         self.truth: dict[int, Pose] = {}  # true poses of the base in the world by the stamps of the pairs
         self.contacts, self._touches, self._closed = 0, False, False
 
-    def clock_ns(self) -> int:
-        """Return the simulated time; it begins with that of the computer, and never runs ahead of it."""
-        return self._vehicle.now_ns
-
     def connect(self, session: Session, motion: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink]:
         """Return one source of both cameras, which advances the time, and the link to the controller."""
         graph, self._report = session.graph, session.warn
@@ -74,7 +73,7 @@ class PacedRobot:
 
     def stats(self) -> dict[str, Any]:
         """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
-        passed_ns = self.clock_ns() - self._start_ns
+        passed_ns = self._vehicle.now_ns - self._start_ns
         factor = round(passed_ns / max(1, time.monotonic_ns() - self._first_ns), 2)
         return {Key.REAL_TIME_FACTOR: factor, "time_s": passed_ns * S_PER_NS, "contacts": self.contacts}
 

@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.errors import DriverError
+from omnid.controller.ipc import ControllerState
 from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.safety_rules import AWAITED
 from omnid.core.frames import of_base
 from omnid.core.rig.rig_health import RigHealth
-from omnid.messages import NavigationUpdate, OdometryUpdate
+from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate
 from omnid.navigation_state import with_reason
+from omnid.stages.obstacles import controller_scan
 from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer, Answers
 
@@ -47,6 +50,20 @@ def send_setpoint(link: DriveLink, update: NavigationUpdate) -> None:
     """Send the setpoint of the navigation, with a stamp of now; a source of higher priority overrides it."""
     if update.setpoint is not None:
         link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
+
+
+def send_scan(link: DriveLink, scan: ObstacleScan) -> None:
+    """Send the obstacles around the base."""
+    link.send(controller_scan(scan))
+
+
+def arming_answers(state: ControllerState) -> Answers:
+    """Return the answer to the newest request to arm; a repeated answer has no effect."""
+    answer = state.arm_answer
+    text = answer.refusal or "armed: it obeys commands from now on"
+    if answer.refusal == AWAITED:
+        text = f"{AWAITED}: {state.problem}"
+    return {answer.id: Answer(not answer.refusal, text)}
 
 
 def navigation_answers(update: NavigationUpdate) -> Answers | None:

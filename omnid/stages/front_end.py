@@ -22,6 +22,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.recognition import Relocaliser
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.types.panorama import Panoramas
+from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import FramePair, OdometryUpdate, StereoDepth
 from omnid.stages.geometry import DenseDepths, Dewarp, Geometry
 from omnid.stages.synchronise import Synchronise
@@ -41,7 +42,11 @@ class FrontEnd:
     """
 
     def __init__(self, geometry: Geometry, config: Config, health: RigHealth | None = None) -> None:
-        """health: state of the rig; None: a new one, with the check of the configuration."""
+        """health: state of the rig; None: a new one, with the check of the configuration.
+
+        The first one compiles functions that no earlier program has compiled; OmnidError where they cannot be kept.
+        """
+        prepare_kernels()
         self.geometry = geometry
         self.health = health or RigHealth(geometry.cylinder, config.rig.check)
         self.pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)

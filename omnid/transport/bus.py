@@ -36,6 +36,7 @@ from omnid.transport.topics import (
     PUBLISHED,
     STOP,
     Answer,
+    Answers,
     Request,
     plain_key,
     request_key,
@@ -216,10 +217,11 @@ class Bus:
         for name, command in COMMANDS.items():
             self._node.subscription(name, command.schema)
 
-    def answer(self, id: int, answer: Answer) -> None:
-        """Answer a request, once, from any thread, without waiting; nothing happens where no query waits for it."""
-        if (query := self._open.pop(id, None)) is not None:
-            self._answered.append((query, answer))
+    def answer(self, answers: Answers) -> None:
+        """Answer requests, each once, from any thread, without waiting; those that no query waits for are left out."""
+        for id, answer in answers.items():
+            if (query := self._open.pop(id, None)) is not None:
+                self._answered.append((query, answer))
 
     def close(self) -> None:
         """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""
@@ -316,5 +318,6 @@ class Bus:
                 self._open.pop(min(self._open.copy()), None)
         elif message.source_info is not None:
             sender = str(message.source_info.source_id.zid)
-        if (answer := self._on_command(Request(topic, payload, sender, sent_ns, id, echo_ns))) is not None:
-            self.answer(id, answer)
+        request = Request(topic, payload, sender, sent_ns, id, echo_ns, has_namesake=not self.is_unique)
+        if (answer := self._on_command(request)) is not None:
+            self.answer({id: answer})

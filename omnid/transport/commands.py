@@ -16,10 +16,10 @@ need not say anything. What ends a motion is accepted in any case.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import secrets
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -27,6 +27,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final, TypeAlias
 
+from drivers.motion import MotionSample
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import OLDER_THAN_STOP, OPERATOR, PLANNER, ArmRequest, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
@@ -34,11 +35,13 @@ from omnid.core.control.safety_rules import BUMPER, CLIFF
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation import requests
 from omnid.core.navigation.path import FARTHEST_M
+from omnid.engine.graph import Stream
+from omnid.engine.logging_setup import log
 from omnid.engine.robot_clock import RobotClock
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport import codec, topics
-from omnid.transport.sensor_codec import LARGEST_VALUE
+from omnid.transport.sensor_codec import LARGEST_VALUE, sample_from_cdr
 from omnid.transport.topics import Answer, Request
 
 MIN_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
@@ -46,6 +49,17 @@ _CLOCKS: Final = (
     "synchronise the clocks, or stamp with the robot's own time: omnid.client attaches it, another program may repeat "
     "the stamp of the newest odom; controller.deadlines.command_s is the longest age"
 )
+_NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
+_NO_SAMPLES: Final = "it is not used, see motion.wheels and motion.imu"
+_NO_MAP_FILE: Final = (
+    "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
+    "without --localize-only"
+)
+# What to do where a topic has no action.
+WHY_NOT: Final = dict.fromkeys(topics.COMMANDS, _NO_MOTOR) | {
+    topics.MAP: _NO_MAP_FILE,
+    **dict.fromkeys(topics.SENSOR_TOPICS, _NO_SAMPLES),
+}
 _STAMPED: Final = re.compile(r"(.*\S)\s+stamp=(\d{1,19})\s*", re.DOTALL)
 Action: TypeAlias = Callable[[Request, int], object]  # takes a message and its arrival, ns of CLOCK_MONOTONIC
 CONTACTS: Final = {topics.BUMPER: BUMPER, topics.CLIFF: CLIFF}
@@ -66,12 +80,12 @@ class Freshness:
     def __init__(self, stale_s: float, clock: RobotClock | None = None, simulated: RobotClock | None = None) -> None:
         """clock: that of the computer. simulated: that of a simulated robot, of which a stamp may be as well."""
         self.stale_ns = round(stale_s * 1e9)
-        self._clock, self._simulated = clock or RobotClock(), simulated
+        self.clock, self._simulated = clock or RobotClock(), simulated
         self._zero_ns = secrets.randbits(61)  # an echo of an earlier run is none of this one
 
     def own_time(self) -> str:
         """Return the robot's own time for senders, who repeat it as an echo."""
-        return str(time.monotonic_ns() + self._zero_ns)
+        return str(self.clock.monotonic_ns() + self._zero_ns)
 
     def sent_ns(self, request: Request, arrival_ns: int, stamp_ns: int = 0) -> int | None:
         """Return when a message was sent; None: it does not say it.
@@ -80,7 +94,7 @@ class Freshness:
         """
         found_ns = [request.echo_ns - self._zero_ns] if request.echo_ns else []
         if unix_ns := stamp_ns or request.sent_ns:
-            found_ns.append(self._clock.stamp_ns(unix_ns))
+            found_ns.append(self.clock.stamp_ns(unix_ns))
             if self._simulated is not None:
                 found_ns.append(arrival_ns - self._simulated.age_ns(unix_ns))
         return min(found_ns, key=lambda sent_ns: abs(arrival_ns - sent_ns), default=None)
@@ -126,22 +140,16 @@ class CommandReceiver:
         freshness: Freshness,
         *,
         controller: DriveLink | None = None,
-        is_unique: Callable[[], bool] = lambda: True,
-        navigate: Callable[[requests.NavigationCommand], None] | None = None,
-        save_map: Callable[[int], object] | None = None,
-        sensors: Mapping[str, Callable[[bytes], object]] = MappingProxyType({}),
-        why_not: Mapping[str, str] = MappingProxyType({}),
-        report: Callable[[str], None] = lambda _: None,
+        navigation: Stream[requests.NavigationCommand] | None = None,
+        saves: Stream[int] | None = None,
+        samples: Mapping[str, Stream[MotionSample]] = MappingProxyType({}),
     ) -> None:
         """freshness: the rule for the times of sending.
 
-        controller: None without wheels. is_unique: False while another robot has this one's name, which is then not
-        armed. navigate: takes requests; None: there is no navigation. save_map: takes the id of a request to save the
-        map; None: it is in no file. sensors: take the bytes of samples, by topic; OmnidError for others. why_not: the
-        remedy for topics that have no action. report: takes a line for the log where a refusal is another one than
-        before. All are called from any thread.
+        controller: None without wheels. navigation: takes requests; None: there is none. saves: takes the ids of
+        requests to save the map; None: it is in no file. samples: take those of wheels and gyro, by topic.
         """
-        self._freshness, self._is_unique, self._why_not, self._report = freshness, is_unique, why_not, report
+        self._freshness, self._samples = freshness, samples
         self.wheels, self.requests, self.samples = MessageCounts(), MessageCounts(), MessageCounts()
         self._counts = dict.fromkeys(topics.NAVIGATION_TOPICS, self.requests)
         self._counts |= dict.fromkeys(topics.SENSOR_TOPICS, self.samples)
@@ -156,12 +164,11 @@ class CommandReceiver:
                 topics.PLANNER_TWIST: partial(self._drive, PLANNER, _twist_command),
                 topics.PLANNER_HEADING: partial(self._drive, PLANNER, _heading_command),
             }
-        if navigate is not None:
-            self._actions |= dict.fromkeys(topics.NAVIGATION_TOPICS, partial(self._ask, navigate))
-        if save_map is not None:
-            self._actions[topics.MAP] = partial(self._save, save_map)
-        for topic, take in sensors.items():
-            self._actions[topic] = partial(_take_payload, take)
+        if navigation is not None:
+            self._actions |= dict.fromkeys(topics.NAVIGATION_TOPICS, partial(self._ask, navigation))
+        if saves is not None:
+            self._actions[topics.MAP] = partial(_save, saves)
+        self._actions |= dict.fromkeys(samples, self._take_sample)
         self._stop_ns = 0  # arrival of the newest stop
         self._touched_ns = dict.fromkeys(CONTACTS.values(), 0)  # when the newest contact was sent, or arrived before
         # Sender and newest arrival of the setpoints of each source: the first one begins a motion, the others go on
@@ -171,11 +178,13 @@ class CommandReceiver:
 
     def receive(self, request: Request) -> Answer | None:
         """Handle one message; return the refusal, None where there is none or the target answers."""
-        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids a command
+        arrival_ns = (
+            self._freshness.clock.monotonic_ns()
+        )  # before anything else: a stop that arrives meanwhile voids a command
         counts = self._counts.get(request.topic, self.wheels)
         try:
             if (action := self._actions.get(request.topic)) is None:
-                raise Refused("not available", self._why_not.get(request.topic, ""))
+                raise Refused("not available", WHY_NOT.get(request.topic, ""))
             if len(request.payload) > (longest := topics.COMMANDS[request.topic].longest):
                 raise Refused("too long", f"{len(request.payload)} bytes, expected at most {longest}")
             action(request, arrival_ns)
@@ -185,7 +194,7 @@ class CommandReceiver:
             counts.refused[error.reason if isinstance(error, Refused) else "malformed"] += 1
             before, counts.refusal = counts.refusal, f"a message on {plain(request.topic)} is refused: {error}"
             if counts.refusal != before:
-                self._report(counts.refusal)
+                log(logging.WARNING, counts.refusal)
             return Answer(False, str(error))
         return None
 
@@ -212,7 +221,7 @@ class CommandReceiver:
     def _arm(self, request: Request, arrival_ns: int) -> None:
         stamp_ns = codec.stamp_of(codec.decoded(request.payload, codec.HEADER_SCHEMA))
         sent_ns = self._freshness.require(request, arrival_ns, stamp_ns)
-        if not self._is_unique():
+        if request.has_namesake:
             raise Refused("another robot has this name", "change bus.robot of one of them")
         if sent_ns <= self._stop_ns:
             raise Refused(OLDER_THAN_STOP)
@@ -231,7 +240,7 @@ class CommandReceiver:
         age_ns = max(0, arrival_ns - sent_ns)
         self._controller.send(TimedSetpoint(arrival_ns, setpoint, source, request.sender, age_ns))
 
-    def _ask(self, navigate: Callable[[requests.NavigationCommand], None], message: Request, arrival_ns: int) -> None:
+    def _ask(self, navigation: Stream[requests.NavigationCommand], message: Request, arrival_ns: int) -> None:
         """Pass on a request to the navigation.
 
         What ends a motion (cancel, pause, finish, stop) is obeyed whatever its age. All else needs a fresh stamp: a
@@ -242,17 +251,19 @@ class CommandReceiver:
         if not (requests.stops_motion(request) or is_finish):
             self._freshness.require(message, arrival_ns, stamp_ns)
         self.requests.accepted += 1
-        stamp_ns = stamp_ns or message.sent_ns
-        navigate(requests.NavigationCommand(request, time.time_ns(), stamp_ns, message.id))
+        stamp_ns, stops = stamp_ns or message.sent_ns, self._controller.statistics.state.stop_count
+        unix_ns = self._freshness.clock.unix_ns(arrival_ns)
+        navigation.push(requests.NavigationCommand(request, unix_ns, stamp_ns, message.id, stops))
 
-    def _save(self, save_map: Callable[[int], object], request: Request, _: int) -> None:
-        if codec.string_from_cdr(request.payload) != topics.SAVE_MAP:
-            raise OmnidError(f'a String "{topics.SAVE_MAP}" was expected')
-        save_map(request.id)
+    def _take_sample(self, request: Request, _: int) -> None:
+        schema = topics.COMMANDS[request.topic].schema
+        self._samples[request.topic].push(sample_from_cdr(request.payload, schema, self._freshness.clock.stamp_ns))
 
 
-def _take_payload(take: Callable[[bytes], object], request: Request, _: int) -> None:
-    take(request.payload)
+def _save(saves: Stream[int], request: Request, _: int) -> None:
+    if codec.string_from_cdr(request.payload) != topics.SAVE_MAP:
+        raise OmnidError(f'a String "{topics.SAVE_MAP}" was expected')
+    saves.push(request.id)
 
 
 def _twist_command(payload: bytes) -> tuple[int, Setpoint]:

@@ -18,7 +18,6 @@ from typing import Any, Final, TypeAlias
 import msgspec
 
 from omnid.core.control.safety_rules import ASKED
-from omnid.engine.graph import Histogram
 from omnid.errors import OmnidError
 from omnid.navigation_state import with_reason
 from omnid.tracking_state import MapState, TrackingState
@@ -94,7 +93,7 @@ class Key(StrEnum):
     REAL_TIME_FACTOR = "real_time_factor"  # simulated time over time on the wall
 
 
-# Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms.
+# Names of measured times: a time `work` has the keys work_p50_ms, work_p99_ms and work_max_ms (Histogram.times_ms).
 WORK: Final = "work"
 CAPTURE_TO_POSE: Final = "capture_to_pose"
 TICK_LATE: Final = "tick_late"
@@ -157,26 +156,9 @@ def by_reason(prefix: str, counts: Mapping[str, int]) -> dict[str, int]:
     return {f"{prefix}{reason}": count for reason, count in sorted(dict(counts).items())}
 
 
-def times(name: str, histogram: Histogram) -> dict[str, float]:
-    """Return median, 99th percentile and maximum in ms; nothing before the first measurement."""
-    if not histogram.count:
-        return {}
-    return {f"{name}_{statistic}": value_ms for statistic, value_ms in histogram.times_ms().items()}
-
-
-def stage_name(stage: str) -> str:
-    """Return the name of a stage's entry."""
-    return f"{STAGE_PREFIX}{stage}"
-
-
 def short_name(name: str) -> str:
     """Return the name of an entry without the daemon's."""
     return name.removeprefix(PREFIX)
-
-
-def time_key(name: str, statistic: str) -> str:
-    """Return the key of a measured time in ms: time_key("work", "p50") == "work_p50_ms"."""
-    return f"{name}_{statistic}_ms"
 
 
 def number(text: str) -> float | None:

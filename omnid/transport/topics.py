@@ -134,6 +134,7 @@ class Request(NamedTuple):
     sent_ns: int = 0  # of Unix time, for a message without stamp; 0: it does not say it
     id: int = 0  # rises with each message
     echo_ns: int = 0  # the robot's own time as the sender repeats it (omnid.transport.commands); 0: it does not
+    has_namesake: bool = False  # another robot on the bus has this one's name
 
 
 class Answer(NamedTuple):

@@ -27,7 +27,7 @@ from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
 from omnid.runs.files import RunPlaces
-from omnid.runs.wiring import Inputs, Outputs, wire
+from omnid.runs.wiring import Inputs, wire
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Dewarp, geometry, with_rims
@@ -96,12 +96,11 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
     with TemporaryDirectory() as work, clock.timed_stages():
         graph = Graph(threaded=False)
         trajectory, cloud = TrajectoryFile(Path(work) / "t"), Path(work) / "m"
-        outputs = Outputs(
-            poses={"trajectory": trajectory, "measured": clock},
-            maps={"map": lambda update: write_ply(cloud, update.points)},
-        )
         read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
-        wire(config, Inputs([read], RunPlaces(config, place, no_op)), FrontEnd(place, config), graph, outputs)
+        streams = wire(config, Inputs([read], RunPlaces(config, place, no_op)), FrontEnd(place, config), graph)
+        graph.sink("trajectory", trajectory, streams.poses)
+        graph.sink("measured", clock, streams.poses)
+        graph.sink("map", lambda update: write_ply(cloud, update.points), streams.maps)
         graph.run()
     found = {label: 1e-6 * spent_ns / (pairs - SKIPPED) for label, spent_ns in clock.stage_ns.items()}
     found["all stages"] = sum(found.values())

@@ -265,7 +265,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
 
     def execute(request: Request) -> None:
         if request.topic == "cmd/arm":
-            bus.answer(request.id, Answer(True, "armed"))
+            bus.answer({request.id: Answer(True, "armed")})
         elif request.topic == "cmd/heading":
             vector = codec.decoded(request.payload, codec.VECTOR_SCHEMA).vector
             velocity_mps, heading_rad = vector.x, vector.z

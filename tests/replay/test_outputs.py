@@ -30,13 +30,13 @@ from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.files import RunPlaces
-from omnid.runs.wiring import Inputs, Outputs, wire
+from omnid.runs.wiring import Inputs, wire
 from omnid.settings import parse
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.transport.codec import decode_map, decode_pose
-from omnid.transport.status_names import ODOMETRY, WHEELS, stage_name
+from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, WHEELS
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.ply import read_ply
@@ -240,7 +240,7 @@ def test_a_recording_holds_all_messages_rig_and_settings(recording: Path, messag
     assert any(message.content.twist.linear.x > 0.1 for message in of(messages, "/omnid/drive")), "it drove"
     assert any(message.content.width > 100 for message in of(messages, "/omnid/cloud")), "there is a map"
     parts = {status.name for message in of(messages, "/omnid/status") for status in message.content.status}
-    assert parts >= {ODOMETRY, WHEELS, "omnid: lower camera", stage_name("odometry")}
+    assert parts >= {ODOMETRY, WHEELS, "omnid: lower camera", f"{STAGE_PREFIX}odometry"}
 
 
 def test_log_times_are_the_stamps(messages: list[Message]) -> None:
@@ -313,9 +313,11 @@ def test_memory_stays_constant(tmp_path: Path) -> None:
     monitor, statistics = MemoryMonitor(), RunStatistics()
     poses = {"monitor": monitor, "statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
     graph = Graph(threaded=True)
-    ends = Outputs(poses=poses, maps={"map": lambda update: write_ply(tmp_path / "map.ply", update.points)})
     read = graph.source("read", lambda: to_and_fro(frames, MANY_PAIRS))
-    wire(config, Inputs([read], RunPlaces(config, place, no_op)), FrontEnd(place, config), graph, ends)
+    streams = wire(config, Inputs([read], RunPlaces(config, place, no_op)), FrontEnd(place, config), graph)
+    for name, sink in poses.items():
+        graph.sink(name, sink, streams.poses, thread="poses")
+    graph.sink("map", lambda update: write_ply(tmp_path / "map.ply", update.points), streams.maps)
     graph.run()
     print(statistics.states, monitor.mib)
     assert statistics.poses == MANY_PAIRS

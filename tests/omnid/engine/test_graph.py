@@ -241,7 +241,7 @@ def test_stages_of_one_thread_share_it_and_pass_messages_directly() -> None:
     numbers = graph.source("numbers", lambda: range(100))
     first = graph.stage("first", noted("first"), numbers, thread="shared")
     graph.sink("last", last, graph.stage("second", noted("second"), first, thread="shared"), thread="shared")
-    graph.stage("other", noted("other"), numbers, thread="shared")
+    graph.sink("other", noted("other"), numbers, thread="shared")
     graph.sink("beside", beside, first, depth=100)
     graph.run()
     of_first = graph.stats["first"]

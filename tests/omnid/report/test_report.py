@@ -30,7 +30,7 @@ from omnid.report.report import report_html
 from omnid.runs.wiring import attached_rig
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, WHEELS, Key, stage_name
+from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, STAGE_PREFIX, WHEELS, Key
 
 TERMINAL = "x\x1b[31m\x07\x9b2J"
 EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
@@ -78,7 +78,7 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
     odometry = {"state": EVIL, "resets": EVIL, "inliers": EVIL, "capture_to_pose_p50_ms": EVIL}
     parts = (
         DiagnosticStatus(EVIL, 2, EVIL, {EVIL: EVIL, "drops": "1"}),
-        DiagnosticStatus(stage_name(EVIL), 1, EVIL, stage),
+        DiagnosticStatus(f"{STAGE_PREFIX}{EVIL}", 1, EVIL, stage),
         DiagnosticStatus(TERMINAL, 1, TERMINAL, {}),
         DiagnosticStatus(ODOMETRY, 0, EVIL, odometry),
     )

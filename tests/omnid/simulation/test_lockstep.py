@@ -231,7 +231,7 @@ def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, caps
     # 1. Nothing was lost on the way, and no rule stopped the wheels.
     stages = {entry.name: entry.values for entry in status.statuses if entry.name.startswith(STAGE_PREFIX)}
     dropped = {name: values[Key.DROPPED] for name, values in stages.items() if Key.DROPPED in values}
-    assert {f"{STAGE_PREFIX}bus", f"{STAGE_PREFIX}odometry"} <= set(dropped)
+    assert {f"{STAGE_PREFIX}bus-poses", f"{STAGE_PREFIX}odometry"} <= set(dropped)
     lossy = {f"{STAGE_PREFIX}bus-status"}  # it comes by the time on the wall, and the newest counts
     assert {name for name, count in dropped.items() if count != "0"} <= lossy
     assert status.value(WHEELS, Key.ARMED) == "1"

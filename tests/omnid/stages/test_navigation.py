@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -45,7 +44,6 @@ T_MAP_ODOM = transform(np.array([2.0, -1.0, 0.3]))  # of the base's frames
 PERIOD_NS = 100_000_000
 ODOM, MAP = NavigationFrame.ODOM, NavigationFrame.MAP
 DEPTH: Any = None  # the stage reads none
-NO_MAP: Any = SimpleNamespace(saves=False)
 UNIT = np.eye(6) * 1e-6
 
 
@@ -69,7 +67,7 @@ class Robot:
     """A base that follows setpoints exactly, seen through the stage's messages."""
 
     def __init__(self, folder: Path, **of_map: Any) -> None:
-        self.files = RouteFiles(RouteFolder(folder), NO_MAP)
+        self.files = RouteFiles(RouteFolder(folder))
         of_map = {"routes": self.files.routes, **of_map}
         self.stage = fixed_map(NavigationSettings(), CollisionSettings(), T_BASE_RIG, **of_map)
         self.stage.process(WheelState(True, False))
@@ -327,7 +325,7 @@ def test_a_full_disk_loses_no_recording(tmp_path: Path) -> None:
     assert not robot.answers[1].done and "navigation.routes" in robot.answers[1].text
     folder.unlink()
     assert not robot.send(FINISH, id=2).teaching and robot.answers[2].done
-    assert list(RouteFiles(RouteFolder(folder), NO_MAP).routes) == ["hall"]
+    assert list(RouteFiles(RouteFolder(folder)).routes) == ["hall"]
 
 
 @pytest.mark.hazard("H50")

@@ -39,7 +39,7 @@ from omnid.navigation_state import NavigationState
 from omnid.runs.files import RouteFiles
 from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import Floor, wheel_state
-from tests.omnid.stages.test_navigation import NO_MAP, fixed_map
+from tests.omnid.stages.test_navigation import fixed_map
 
 Array = NDArray[np.float64]
 TICK_S, TICKS_A_POSE = 0.02, 5
@@ -59,7 +59,7 @@ class Walk:
         self.rng, self.seen, self.t_s = random.Random(seed), Counter[str](), 1000.0
         self.law = ControlLaw(SETTINGS, -1)
         self.stage = fixed_map(NAVIGATION, SETTINGS.collision, np.eye(4), is_new=True)
-        self.files = RouteFiles(RouteFolder(folder), NO_MAP)
+        self.files = RouteFiles(RouteFolder(folder))
         self.pose, self.motion = np.zeros(3), (0.0, 0.0)
         self.seq = self.resets = 0
         self.state, self.map_state, self.kind = TrackingState.TRACKING, MapState.LOCALIZED, "free"

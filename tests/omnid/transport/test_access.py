@@ -101,7 +101,7 @@ def commands_to(config: BusConfig) -> Iterator[tuple[Bus, list[str]]]:
 
         def take(request: Request) -> None:
             received.append(request.topic)
-            bus.answer(request.id, Answer(True, "armed"))
+            bus.answer({request.id: Answer(True, "armed")})
 
         bus.subscribe_commands(take)
         yield bus, received

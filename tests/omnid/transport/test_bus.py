@@ -349,8 +349,8 @@ def test_a_request_gets_the_answer_that_is_given_later() -> None:
         wait_until(lambda: bool(received))
         assert received[0].topic == "cmd/route" and received[0].sender and received[0].id > 0
         assert abs(received[0].sent_ns - time.time_ns()) < 60 * 10**9 and not asked.done()
-        bus.answer(received[0].id, answer)
-        bus.answer(received[0].id, Answer(False, "a second one"))
+        bus.answer({received[0].id: answer})
+        bus.answer({received[0].id: Answer(False, "a second one")})
         assert asked.result() == answer
 
 

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import random
 import re
 import struct
 import time
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from drivers.motion import GyroSample, MotionSample, WheelSample
+from omnid.controller.link import ControllerStatistics
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import BUMPER, CLIFF
 from omnid.core.navigation.requests import GoalRequest, NavigationCommand
+from omnid.engine.graph import StageStats, Stream
+from omnid.engine.logging_setup import LOGGER
 from omnid.engine.robot_clock import RobotClock
 from omnid.transport import codec
 from omnid.transport.codec import BOOL_SCHEMA, encoded, goal_cdr, path_cdr, string_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.sensor_codec import gyro_cdr, sample_from_cdr, wheel_cdr
-from omnid.transport.topics import COMMANDS, IMU, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request
+from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
+from omnid.transport.topics import IMU, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request
 from tests.omnid.transport.bus_fixtures import damaged
 from tests.set_clock import SetClock
 
@@ -34,11 +38,15 @@ STORE: Any = get_typestore(Stores.ROS2_HUMBLE)
 OFFSET_NS = 10**18
 
 
-def stamp_of(unix_ns: int) -> int:
-    return unix_ns - OFFSET_NS
-
-
 WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5, of_base=True)
+
+
+def logged(lines: list[str]) -> list[str]:
+    """Add the lines of the log from now on to a list, which is returned."""
+    handler = logging.Handler()
+    handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
+    LOGGER.addHandler(handler)
+    return lines
 
 
 # Commands.
@@ -54,17 +62,15 @@ class AcceptedCommands:
         self.arms: list[ArmRequest] = []
         self.contacts: list[tuple[str, bool]] = []
         self.commands: list[TimedSetpoint] = []
-        self.lines: list[str] = []
+        self.lines = logged([])
         self.freshness, self.is_unique = Freshness(STALE_S, *clocks), True
         controller: Any = self
-        self.receiver = CommandReceiver(
-            self.freshness, controller=controller, is_unique=lambda: self.is_unique, report=self.lines.append
-        )
+        self.receiver = CommandReceiver(self.freshness, controller=controller)
         self.counts = self.receiver.wheels
 
     def receive(self, *message: Any, **more: Any) -> Answer | None:
         """Have a message handled; return the answer."""
-        return self.receiver.receive(Request(*message, **more))
+        return self.receiver.receive(Request(*message, **more, has_namesake=not self.is_unique))
 
     def send(self, given: TimedSetpoint | ArmRequest) -> None:
         """Keep a setpoint or a request to arm."""
@@ -396,10 +402,13 @@ class Received:
 
     def __init__(self) -> None:
         self.commands: list[NavigationCommand] = []
-        self.lines: list[str] = []
+        self.lines = logged([])
         self.answer: Answer | None = None  # of the newest message
         self.freshness = Freshness(0.5)
-        self.receiver = CommandReceiver(self.freshness, navigate=self.commands.append, report=self.lines.append)
+        navigation = Stream[NavigationCommand]()
+        controller: Any = SimpleNamespace(statistics=ControllerStatistics(StageStats()))
+        navigation.readers.append(cast("Any", self.commands.append))
+        self.receiver = CommandReceiver(self.freshness, controller=controller, navigation=navigation)
         self.counts = self.receiver.requests
 
     def send(self, topic: str, payload: bytes, sent_ns: int = 0, echo_ns: int = 0) -> NavigationCommand | None:
@@ -486,13 +495,11 @@ def test_damaged_messages_never_raise_and_lead_to_finite_goals() -> None:
 
 
 def receiver(taken: list[MotionSample], lines: list[str], *sensors: str) -> CommandReceiver:
-    def take(topic: str, payload: bytes) -> None:
-        taken.append(sample_from_cdr(payload, COMMANDS[topic].schema, stamp_of))
-
-    used = {topic: partial(take, topic) for topic in sensors or SENSOR_TOPICS}
-    return CommandReceiver(
-        Freshness(STALE_S), sensors=used, why_not={WHEEL_ODOM: "see motion.wheels"}, report=lines.append
-    )
+    logged(lines)
+    samples = Stream[MotionSample]()
+    samples.readers.append(cast("Any", taken.append))
+    clock = SetClock(OFFSET_NS).clock()
+    return CommandReceiver(Freshness(STALE_S, clock), samples=dict.fromkeys(sensors or SENSOR_TOPICS, samples))
 
 
 def test_samples_arrive_in_the_time_of_the_images() -> None:

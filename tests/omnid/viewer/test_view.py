@@ -27,7 +27,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.sensor_codec import image_cdr
-from omnid.transport.status_names import stage_name
+from omnid.transport.status_names import STAGE_PREFIX
 from omnid.transport.topics import PUBLISHED, ros_name
 from tests.conftest import PAIRS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
@@ -142,7 +142,7 @@ def publish(bus: Bus, number: int) -> None:
         PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes(),
     )
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
-    statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
+    statuses = [DiagnosticStatus(f"{STAGE_PREFIX}odometry", 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]
     bus.publish(
