@@ -10,7 +10,7 @@ import shutil
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing, nullcontext
 from typing import IO, Any, Final, NamedTuple
 
@@ -48,11 +48,14 @@ class ReceivedMessage(NamedTuple):
 class RobotState:
     """Newest pose and status of one robot, and counters, in constant memory.
 
-    Messages wait in an inbox, of which the oldest are dropped when it is full.
+    Messages wait in an inbox, of which the oldest are dropped when it is full; of some topics only the newest waits.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, newest_only: Collection[str] = ()) -> None:
+        """newest_only: the topics of which only the newest message waits, behind those of all others."""
         self._inbox: deque[ReceivedMessage] = deque(maxlen=_INBOX_DEPTH)
+        self._newest: dict[str, ReceivedMessage] = {}
+        self._newest_only = newest_only
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
@@ -62,16 +65,25 @@ class RobotState:
 
     def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
         """Add a message that has just arrived, from any thread; does not block."""
-        self._inbox.append(ReceivedMessage(topic, payload, attachment, time.monotonic()))
+        message = ReceivedMessage(topic, payload, attachment, time.monotonic())
+        if topic in self._newest_only:
+            self._newest[topic] = message
+        else:
+            self._inbox.append(message)
+
+    @property
+    def is_waiting(self) -> bool:
+        """True if a message waits."""
+        return bool(self._inbox or self._newest)
 
     def next(self, timeout_s: float) -> tuple[ReceivedMessage, Any] | None:
         """Process the oldest message of the inbox; return it and its content, or None after the timeout."""
         end_s = time.monotonic() + timeout_s
-        while not self._inbox:
+        while not self.is_waiting:
             if time.monotonic() >= end_s:
                 return None
             time.sleep(PERIOD_S)
-        message = self._inbox.popleft()
+        message = self._inbox.popleft() if self._inbox else self._newest.popitem()[1]
         return message, self.process(message)
 
     def process(self, message: ReceivedMessage) -> Any:

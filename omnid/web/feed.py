@@ -24,7 +24,7 @@ from starlette.responses import PlainTextResponse, Response
 
 from calib import se3
 from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
-from omnid.monitor.robot_state import LEVELS, ReceivedMessage, RobotState, importance
+from omnid.monitor.robot_state import LEVELS, RobotState, importance
 from omnid.monitor.teleop import PERIOD_S
 from omnid.plain_text import plain
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
@@ -46,7 +46,7 @@ class RobotFeed:
     def __init__(self, bus: BusConfig) -> None:
         """bus: settings of the connection, which has been checked."""
         self.bus = bus
-        self.state = RobotState()
+        self.state = RobotState(_NEWEST_ONLY)
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
         # Of the news: it grows by one each time, and more slowly than this first one, which is Unix time in ms: pages
@@ -56,7 +56,6 @@ class RobotFeed:
         self._images: dict[str, Response] = {}  # cells of the map, and the panorama
         self._wanted_until_s = -math.inf  # the panorama
         self._map_in_odom: list[float] | None = None
-        self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
 
     def news(self, seen: int) -> dict[str, Any]:
         """Return all that has changed since a version, and the state."""
@@ -65,7 +64,7 @@ class RobotFeed:
         state = state_news(self.bus.robot, self.state, self.link)
         state |= {"panorama_comes": PANORAMA in self._news, "map_in_odom": self._map_in_odom}
         found = {"seen": self.version, "state": state}
-        return found | {kind: content for kind, (version, content) in self._news.items() if version > seen}
+        return found | {kind: content for kind, (version, content) in self._news.copy().items() if version > seen}
 
     async def live(self, request: Request) -> Response:
         """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
@@ -95,22 +94,13 @@ class RobotFeed:
         given_s = -math.inf
         while True:
             await asyncio.sleep(PERIOD_S)
-            has_news = self.process_inbox() or bool(self._large)
-            while self._large:
-                await asyncio.to_thread(self.process_large, self._large.popitem()[1])
-            if has_news or time.monotonic() > given_s + QUIET_S:
+            if self.state.is_waiting or time.monotonic() > given_s + QUIET_S:
+                await asyncio.to_thread(self.process_inbox)  # maps and images take time
                 self.version, given_s = self.version + 1, time.monotonic()
 
     async def _connect(self) -> None:
         """Open the connection, take what was published before it, then receive the panorama while browsers show it."""
-
-        def receive(topic: str, payload: bytes, attachment: bytes) -> None:
-            """Take a message, in a thread of zenoh."""
-            if topic in _NEWEST_ONLY:  # in place of one that was not processed yet
-                self._large[topic] = ReceivedMessage(topic, payload, attachment, 0.0)
-            else:
-                self.state.put(topic, payload, attachment)
-
+        receive = self.state.put
         while self.robot is None:
             try:
                 self.robot = await asyncio.to_thread(Robot, settings=self.bus)
@@ -135,11 +125,10 @@ class RobotFeed:
         """Have a content sent with the next news."""
         self._news[kind] = self.version + 1, content
 
-    def process_inbox(self) -> bool:
-        """Process poses and statuses, return True if any came; forget the statuses of a daemon that has ended."""
-        before, has_any, has_news = self.state.pose, False, False
+    def process_inbox(self) -> None:
+        """Process what has come; forget the statuses of a daemon that has ended."""
+        before, has_news = self.state.pose, False
         while (received := self.state.next(0.0)) is not None:
-            has_any = True
             match received[1]:
                 case Pose() as pose:
                     # Another run has another odom, for which the pages load again.
@@ -152,27 +141,22 @@ class RobotFeed:
                     self._map_in_odom = map_in_odom(in_map, self.state.recent) or self._map_in_odom
                 case Diagnostics():
                     has_news = True
+                case Scan() as scan:
+                    self._set(SCAN, scan_news(scan, list(self.state.recent)))
+                case NavigationReport() as report:
+                    self._set(NAVIGATION, asdict(report))
+                case PlanarPath(frame=frame, xy=xy) if frame == "odom":
+                    self._set("path", xy.round(3).tolist())
+                case Map() as grid:
+                    header, cells = map_cells(grid)
+                    encoding = {"content-encoding": "deflate"}
+                    self._images["map"] = Response(cells, headers=encoding, media_type="application/octet-stream")
+                    self._set("map", {**header, "version": self.version + 1})
+                case Panorama(data=data):
+                    self._images[PANORAMA] = Response(data, media_type="image/jpeg")
+                    self._set(PANORAMA, self.version + 1)
         if has_news or not self.state.statuses:
             self._set("parts", parts_news(self.state))
-        return has_any
-
-    def process_large(self, message: ReceivedMessage) -> None:
-        """Process a scan, a report of the navigation, a map, a path or a panorama in a thread: that takes time."""
-        match self.state.process(message):
-            case Scan() as scan:
-                self._set(SCAN, scan_news(scan, list(self.state.recent)))
-            case NavigationReport() as report:
-                self._set(NAVIGATION, asdict(report))
-            case PlanarPath(frame=frame, xy=xy) if frame == "odom":
-                self._set("path", xy.round(3).tolist())
-            case Map() as grid:
-                header, cells = map_cells(grid)
-                encoding = {"content-encoding": "deflate"}
-                self._images["map"] = Response(cells, headers=encoding, media_type="application/octet-stream")
-                self._set("map", {**header, "version": self.version + 1})
-            case Panorama(data=data):
-                self._images[PANORAMA] = Response(data, media_type="image/jpeg")
-                self._set(PANORAMA, self.version + 1)
 
 
 def _text(text: str, status: HTTPStatus) -> Response:

@@ -248,10 +248,10 @@ def test_a_drive_is_cancelled_when_its_command_is_ended(
         def take(request: Request) -> None:
             if request.topic == NAVIGATION_TOPIC:
                 cancelled.append(string_from_cdr(request.payload))
-                bus.answer(request.id, Answer(True, "cancelled"))
+                bus.answer({request.id: Answer(True, "cancelled")})
                 return
             if is_answered:
-                bus.answer(request.id, Answer(True, "it drives"))
+                bus.answer({request.id: Answer(True, "it drives")})
             asked.append(request.topic)
 
         bus.subscribe_commands(take)
@@ -273,7 +273,7 @@ def test_a_route_that_is_too_short_is_taught_on() -> None:
 
         def take(request: Request) -> None:
             asked.append(string_from_cdr(request.payload))
-            bus.answer(request.id, Answer(asked != ["teach hall", "finish"], "too short"))
+            bus.answer({request.id: Answer(asked != ["teach hall", "finish"], "too short")})
 
         bus.subscribe_commands(take)
         command = [sys.executable, "-c", HEARS_ALL, "route", "teach", "hall", "--connect", endpoint]

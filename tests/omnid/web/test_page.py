@@ -64,7 +64,7 @@ class Navigator:
     def _take(self, request: Request) -> None:
         text = string_from_cdr(request.payload)
         self.asked.append(text)
-        self._bus.answer(request.id, Answer(True, f"does {text}"))
+        self._bus.answer({request.id: Answer(True, f"does {text}")})
 
     def publish(self) -> None:
         """Report the navigation, and that it is armed."""

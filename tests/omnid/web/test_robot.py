@@ -22,7 +22,7 @@ from prometheus_client import parser
 
 from calib import se3
 from drivers.frame import Frame
-from omnid.monitor.robot_state import ReceivedMessage, RobotState
+from omnid.monitor.robot_state import RobotState
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import (
@@ -73,7 +73,7 @@ class Rover:
         elif request.topic != "cmd/stop":
             if request.topic in ("cmd/route", "cmd/navigation"):
                 self.texts.append(string_from_cdr(request.payload))
-            self._bus.answer(request.id, Answer(self.is_granted, "as asked" if self.is_granted else "a fault holds"))
+            self._bus.answer({request.id: Answer(self.is_granted, "as asked" if self.is_granted else "a fault holds")})
 
     def has_more_than(self, count: int) -> bool:
         """True if it got more twists."""
@@ -424,9 +424,9 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
     feed.state.put(
         "map_pose", codec.encoded(codec.MAP_POSE_SCHEMA, (10**9 + 4, "map"), (np.eye(4), np.eye(6).ravel())), b""
     )
-    feed.process_inbox()
     for topic, payload in large.items():
-        feed.process_large(ReceivedMessage(topic, payload, b"", 0.0))
+        feed.state.put(topic, payload, b"")
+    feed.process_inbox()
     news = feed.news(0)
     assert news["state"]["map_in_odom"] is not None and news["map"]["width"] == 3 and news["panorama"]
     assert news["scan"]["points"] and news["navigation"]["task"] == "goal" and len(news["path"]) == 2
