@@ -119,11 +119,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
 
 
-def facts(rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of names and values; both are HTML."""
-    return f"<div class='words facts'>{table(('', ''), rows)}</div>"
-
-
 def note(text: str) -> str:
     """Return a paragraph with a remark."""
     return f"<p class='note'>{escape(text)}</p>"

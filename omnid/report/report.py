@@ -16,7 +16,7 @@ from omnid.formats.tum import Trajectory
 from omnid.plain_text import MAX_ENTRIES, utc
 from omnid.recordings.evaluation import associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
-from omnid.report.page import Array, Curve, chart, colours, embedded, facts, grid, note, page, style_and_script, table
+from omnid.report.page import Array, Curve, chart, colours, embedded, grid, note, page, style_and_script, table
 from omnid.report.recorded_run import LEVELS, STATES, UNKNOWN, Event, RecordedRun
 from omnid.transport import status_names
 from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, STAGE_PREFIX, WORK, Key, short_name
@@ -90,7 +90,8 @@ def _truth_section(run: RecordedRun, truth: Trajectory) -> list[str]:
         chart("Error of the position", [Curve("", t_s, position_m)], unit="m"),
         chart("Error of the heading, to the left", [Curve("", t_s, np.rad2deg(heading_rad))], "deg"),
     ]
-    return [facts([re.split(" {2,}", line, maxsplit=1) for line in escape(str(metrics)).splitlines()]), grid(figures)]
+    facts = table(("", ""), [re.split(" {2,}", line, maxsplit=1) for line in escape(str(metrics)).splitlines()])
+    return [f"<div class='words facts'>{facts}</div>", grid(figures)]
 
 
 def _plan(run: RecordedRun, events: Sequence[Event]) -> list[str]:

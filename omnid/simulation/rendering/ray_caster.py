@@ -150,7 +150,7 @@ def render_grey(
     reach_m = float(np.linalg.norm(table.origins, axis=0).max())
     reach_m += float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
     # 2. The rectangles in the frame of the first pose by their least distance, and those that tiles may see.
-    corners = se3.apply(se3.inverse(poses[0]), corners_of(scene))
+    corners = se3.apply(se3.inverse(poses[0]), np.array([r.corners for r in scene]))
     distance_m = _distances_m(corners)
     order = np.argsort(distance_m, kind="stable")
     corners, distance_m = corners[order], distance_m[order]
@@ -207,12 +207,6 @@ def tiles_that_see(table: RayTable, corners: Array, parallax_rad: Array) -> NDAr
     sines = np.min([table.axes @ normals[:, side].T for side in range(4)], axis=0)
     reach_rad = np.minimum(table.angles[:, None] + parallax_rad, np.pi / 2)
     return np.asarray(sines >= -np.sin(reach_rad))
-
-
-def corners_of(rectangles: Sequence[Rectangle]) -> Array:
-    """Return the corners (R, 4, 3) of rectangles."""
-    origins, u, v = (np.array([getattr(r, name) for r in rectangles]) for name in ("origin", "edge_u", "edge_v"))
-    return np.stack([origins, origins + u, origins + u + v, origins + v], axis=1)
 
 
 def _distances_m(corners: Array) -> Array:

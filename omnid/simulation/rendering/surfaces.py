@@ -206,7 +206,7 @@ class Rectangle:
         n = np.cross(self.edge_u, self.edge_v)
         return np.asarray(n / np.linalg.norm(n))
 
-    @property
+    @cached_property
     def corners(self) -> Array:
         """Return the four corners (4, 3) [m]: upper left, upper right, lower right, lower left."""
         return self.points(np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]))
