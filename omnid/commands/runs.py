@@ -242,7 +242,7 @@ def _drive(args: argparse.Namespace) -> int:
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
     prepare_kernels()  # which says so where it takes long
     show = no_op if args.quiet else partial(print, flush=True)
-    show("a simulated robot is taught an oval and repeats it, in its own\ntime: a minute or two")
+    show("a simulated robot is taught an oval and repeats it, which takes a minute or two")
     is_reached, lines = demonstrate(image, config, args.seed, show)
     print(*lines, f"written   {image}, {place_map}", sep="\n")
     return int(not is_reached)

@@ -63,7 +63,7 @@ class RunPlaces:
         if self.is_extended:
             check_outputs([("--map", path)], [])
         if self.is_extended and not path.exists():
-            log(logging.INFO, f"{path.name}: there is no such map: this run begins a new one")
+            log(logging.INFO, f"a new map begins: {path.name}")
         elif self.places is not None:
             self.places, rig = read_places(path)
             if difference := rig.difference(self._rig):

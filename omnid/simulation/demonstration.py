@@ -52,14 +52,14 @@ class TeachAndRepeat:
         while moment.place is None or not moment.controller.armed:
             moment = yield [] if moment.place is None else ["arm"]
         # 2. Teach the route along an oval; a route of that name is from an earlier demonstration.
-        self.show(f"{moment.time_s:5.1f} s: is taught the route: it is driven along an oval")
+        self.show(f"{moment.time_s:5.1f} s: the robot is taught a route: it is driven along an oval")
         teach = RouteRequest(RouteAction.TEACH, ROUTE, replace=True)
         moment = yield from self._ended([teach, PathRequest(NavigationFrame.ODOM, oval(), 0.0)])
         # 3. Repeat it, when its start is recognised.
         if self.end == NavigationState.REACHED:
             while moment.place is None or moment.place.state is not MapState.LOCALIZED:
                 moment = yield []
-            self.show(f"{moment.time_s:5.1f} s: repeats the route in the map that it has made")
+            self.show(f"{moment.time_s:5.1f} s: the robot repeats the route in the map that it has made")
             self.repeated_s, self.end = moment.time_s, ""
             yield from self._ended([RouteRequest(RouteAction.FINISH), RouteRequest(RouteAction.REPEAT, ROUTE)])
         while True:
