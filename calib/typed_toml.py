@@ -11,7 +11,6 @@ Values are checked by msgspec, in one call. An error is one line that names the 
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import re
@@ -91,28 +90,28 @@ def convert(root: type[T], table: dict[str, Any], path: Path = ()) -> T:
 
     path: the position of the table within its file, for messages.
     """
-    for section, place, is_known in _keys(root, table, path):
-        if not is_known:
-            raise unknown_key(root, section, place)
+    _require_known(root, table, path)
     try:
         return msgspec.convert(table, root)
     except msgspec.ValidationError as error:
         raise ValueError(_explained(str(error), root, table, path)) from None
 
 
-def _keys(section: Any, table: dict[str, Any], path: Path) -> Iterator[tuple[Any, Path, bool]]:
-    """Yield section and path of every key of a table, and whether it is known; ValueError for numbers not finite."""
+def _require_known(section: Any, table: dict[str, Any], path: Path) -> None:
+    """Raise ValueError for an unknown key of a table, and for a number that is not finite."""
     types = types_of(section)
     for name, value in table.items():
         place = (*path, name)
-        yield section, place, name in types
+        if name not in types:
+            known = ", ".join(dotted((*path, other)) for other in types)
+            raise ValueError(f"unknown key {dotted(place)}: known are {known}")
         kind = types[name]
         if is_section(kind) and isinstance(value, dict):
-            yield from _keys(kind, value, place)
+            _require_known(kind, value, place)
         elif (element := _element(kind)) is not None and isinstance(value, list):
             for number, one in enumerate(value):
                 if isinstance(one, dict):
-                    yield from _keys(element, one, (*path, f"{name}[{number}]"))
+                    _require_known(element, one, (*path, f"{name}[{number}]"))
         elif not _is_finite(value):
             raise ValueError(f"{dotted(place)}: expected {described(kind)}, found {shown(value)}")
 
@@ -195,16 +194,6 @@ def key_paths(section: Any, path: Path = ()) -> Iterator[Path]:
             yield from key_paths(kind, (*path, name))
         else:
             yield (*path, name)
-
-
-def unknown_key(root: Any, section: Any, path: Path) -> ValueError:
-    """Return the error for an unknown key, with a key that has a similar name."""
-    neighbours = [(*path[:-1], name) for name in types_of(section)]
-    for candidates in (neighbours, list(key_paths(root))):
-        names = {other[-1]: other for other in reversed(candidates)}
-        for near in difflib.get_close_matches(path[-1][:80], names, n=1, cutoff=0.7):
-            return ValueError(f"unknown key {dotted(path)}: did you mean {dotted(names[near])}?")
-    return ValueError(f"unknown key {dotted(path)}: known are {', '.join(map(dotted, neighbours))}")
 
 
 def described(kind: Any) -> str:

@@ -80,7 +80,7 @@ def test_an_override_needs_no_quotes(override: str, value: str) -> None:
     ("text", "expected"),
     [
         (f"{'q' * 300} = 1", "unknown key 'qqq"),
-        ("[stereo]\nwindow = 5", "unknown key stereo.window: did you mean stereo.window_px?"),
+        ("[stereo]\nwindow = 5", "unknown key stereo.window: known are stereo.window_px, "),
         ("stereo = 5", "stereo: expected a section, found 5"),
         ("stereo.window_px = '11'", "stereo.window_px: expected an integer from 3 to 31, found '11'"),
         ("stereo.subpixel = 1", "stereo.subpixel: expected true or false, found 1"),

@@ -48,7 +48,7 @@ def test_check_names_what_is_wrong(omnid: Command, tmp_path: Path) -> None:
     file.write_text("[bus]\nrobot = 'rover'\n")
     assert omnid("config", "check", file).out == f"{file}: good\n"
     file.write_text("[bus]\nrobots = 'rover'\n")
-    assert "did you mean bus.robot?" in omnid.refused("config", "check", file)
+    assert "known are bus.robot, " in omnid.refused("config", "check", file)
     file.write_text("[motor]\nprotocol = 'waveshare_json'\n")
     assert "expected one of line, roboteq" in omnid.refused("config", "check", file)
     assert "expected one of line, roboteq" in omnid.refused("motor", "test", "--motor", "simulated", "--config", file)
