@@ -242,13 +242,8 @@ def _flow(
         up, bent = np.eye(4), slopes[rows] / (1.0 + camera * slopes[rows, 1:])
         up[2, 3] = -camera * baseline_m
         T_now_last = np.tile(up @ se3.inverse(now.T_odom_rect) @ last.T_odom_rect @ se3.inverse(up), (len(rows), 1, 1))
-        of_last = (
-            {0: last.pair[camera]},
-            np.zeros(len(rows), np.intp),
-            start[rows],
-            (se3.apply(up, seen[0][rows]), bent),
-        )
-        templates = plane_templates(*of_last, T_now_last, model, there[rows])
+        surfaces = se3.apply(up, seen[0][rows]), bent
+        templates = plane_templates(last.pair[camera], start[rows], surfaces, T_now_last, model, there[rows])
         aligned = align(templates, now.pair[camera], there[rows])
         is_aligned = rows[aligned.found]
         there[is_aligned], found[is_aligned] = aligned.pixels[aligned.found], True

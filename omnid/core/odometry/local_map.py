@@ -21,7 +21,14 @@ from calib import se3
 from calib.panorama import MIN_RADIUS
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import RigVelocity
-from omnid.core.odometry.plane_patches import REACH_PX, AlignedPatches, align, moved_slopes, plane_templates
+from omnid.core.odometry.plane_patches import (
+    REACH_PX,
+    WINDOW_PX,
+    AlignedPatches,
+    align,
+    moved_slopes,
+    plane_templates,
+)
 from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
@@ -283,14 +290,13 @@ class LocalMap:
         predicted (M, 2): their pixels by that pose. A patch is found where it has texture and moved by less than
         reach_px from there. upper: it is the upper panorama.
         """
-        table, keyframes = self.table, self.keyframes
-        anchors = table.anchor[landmarks]
-        T_curr_ref = self.from_anchors(se3.inverse(T_odom_rect), landmarks)
-        surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
-        images = {seq: keyframe.lower for seq, keyframe in keyframes.items()}
-        templates = plane_templates(
-            images, anchors, table.anchor_pixels[landmarks], surfaces, T_curr_ref, self._model, predicted, upper=upper
-        )
+        table, T_curr_ref = self.table, self.from_anchors(se3.inverse(T_odom_rect), landmarks)
+        templates = np.empty((len(landmarks), WINDOW_PX + 2, WINDOW_PX + 2), np.float32)
+        for seq, keyframe in self.keyframes.items():
+            own = np.flatnonzero(table.anchor[landmarks] == seq)
+            rows = landmarks[own]
+            seen = table.anchor_pixels[rows], (table.anchor_points[rows], table.slopes[rows]), T_curr_ref[own]
+            templates[own] = plane_templates(keyframe.lower, *seen, self._model, predicted[own], upper=upper)
         return align(templates, panorama, predicted, reach_px)
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:

@@ -42,7 +42,6 @@ from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map that make a frame textured, since not all will be located.
@@ -74,8 +73,7 @@ class KeyframeLocaliser(Protocol):
 class _Prediction:
     """A frame and what is known of it before its landmarks are searched."""
 
-    frame: StereoFrame
-    usable: Flags  # (H, W) pixels in which landmarks may lie
+    frame: StereoFrame  # usable: without what is fixed to the rig
     dt_s: float
     since_fix_s: float  # since the last accepted pose
     T_odom_rect: Array  # (4, 4) predicted
@@ -162,8 +160,7 @@ class VisualOdometry:
         #    only they know a long gap.
         T_prev_curr, is_measured = self._motion.step(frame.interval_s, dt_s, limits.max_gap_s)
         now = _Prediction(
-            frame,
-            self._static_mask.without(frame.usable),
+            replace(frame, usable=self._static_mask.without(frame.usable)),
             dt_s,
             max(dt_s, SHORTEST_STEP_S) + self._since_fix_s,
             self._T_odom_rect @ T_prev_curr,
@@ -191,7 +188,7 @@ class VisualOdometry:
         if searched and (after_refusal or dt_s > limits.max_gap_s):
             relied = min(limits.good_inliers, limits.min_inlier_ratio * plausible[0].visible) if plausible else 0.0
             if not plausible or plausible[0].inliers < relied:
-                recognised = self.relocalise(frame, now.exposure)
+                recognised = self.relocalise(now.frame, now.exposure)
                 plausible = [recognised] if recognised is not None and self._is_plausible(recognised, now) else []
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = _step(now.T_odom_rect, plausible[0].T_odom_rect) if plausible and after_refusal else np.zeros(6)
@@ -226,7 +223,7 @@ class VisualOdometry:
         """Return the pose of a frame in the map, and those of other motions; none: no landmarks were found."""
         if now.is_measured:
             self._other.agree()
-        found = self._search.find(now.frame, now.usable, self._T_odom_rect, now.T_odom_rect, now.exposure)
+        found = self._search.find(now.frame, self._T_odom_rect, now.T_odom_rect, now.exposure)
         # After a refused frame the displacements from an unknown place lead anywhere: relocalisation decides.
         if found is None or self._refused_s is not None:
             return [] if found is None else [found]
@@ -255,7 +252,7 @@ class VisualOdometry:
     def _is_textured(self, now: _Prediction) -> bool:
         """True if the frame has enough corners for a map."""
         least = TEXTURED_CORNERS * self._limits.min_inliers
-        return len(corners(now.frame.lower, now.usable, least)) >= least
+        return len(corners(now.frame.lower, now.frame.usable, least)) >= least
 
     def _accept(self, now: _Prediction, estimate: PoseEstimate, *, is_reset: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""
@@ -374,7 +371,7 @@ class VisualOdometry:
         seen: the estimate whose landmarks stay; None: all are new.
         """
         pixels, views = (np.zeros((0, 2)), np.zeros((0, 3))) if seen is None else (seen.pixels, seen.views)
-        points = corners(now.frame.lower, clear_around(now.usable, pixels), self._limits.features - len(pixels))
+        points = corners(now.frame.lower, clear_around(now.frame.usable, pixels), self._limits.features - len(pixels))
         frame = replace(now.frame, exposure=exposure)
         new = located(frame, points, self._model, self._upper_klt, exposure, views)
         keyframe = Keyframe(frame.seq, frame.lower, T_odom_rect, covariance)

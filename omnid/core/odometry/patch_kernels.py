@@ -13,7 +13,6 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 # Enough: 98 % of the patches of test_plane_patches.py end before; a last step is below the hundredths that noise
 # leaves.
@@ -33,12 +32,11 @@ LANES = 8  # columns that the compiler computes at once
 
 
 @compiled(
-    "(u1[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1], f8, f4[:, :, ::1])",
+    "(u1[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1], f8, f4[:, :, ::1])",
     writes=("templates",),
 )
 def sample(
     image: Image,
-    chosen: Indices,
     centres: Array,
     points: Array,
     normals: Array,
@@ -48,7 +46,7 @@ def sample(
     focal_px: float,
     templates: Floats,
 ) -> None:
-    """Write the templates (N, T, T) of the chosen patches, whose image this is.
+    """Write the templates (N, T, T) of patches of an image.
 
     centres (N, 2) [px] in the image; points (N, 3) [m] there on planes with normals (N, 3) [1/m]; T_curr_ref
     (N, 4, 4); height_m: of the current viewpoint above the lower one; shift (N, 2) [px] of the templates' middle pixels
@@ -60,7 +58,7 @@ def sample(
     greys, at, weights = cell.reshape(-1), np.empty(side, np.int32), np.empty((3, 4 * side), np.float32)
     across, down, part = weights[0], weights[1], weights[2]
     columns, rows = np.empty((3, 3)), np.empty((3, 3))
-    for n in chosen:
+    for n in range(len(templates)):
         # A place that is NaN or outside has no template.
         is_near = 0 <= centres[n, 0] < image.shape[1] and 0 <= centres[n, 1] < image.shape[0]
         if not (is_near and abs(shift[n, 0]) <= 1 and abs(shift[n, 1]) <= 1):

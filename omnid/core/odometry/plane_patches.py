@@ -12,7 +12,6 @@ window; between them it is a quadratic polynomial to hundredths of a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +26,6 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 WINDOW_PX = 13  # side of a patch
 SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the dense disparity is taken
@@ -55,8 +53,7 @@ class AlignedPatches:
 
 
 def plane_templates(
-    images: Mapping[int, PaddedPanorama],
-    anchors: Indices,
+    image: PaddedPanorama,
     pixels: Array,
     surfaces: tuple[Array, Array],
     T_curr_ref: Array,
@@ -66,27 +63,21 @@ def plane_templates(
     upper: bool = False,
     window_px: int = WINDOW_PX,
 ) -> Floats:
-    """Return templates (N, T, T) of patches at pixels (N, 2) of images, less grey 128, as the current view shows them.
+    """Return templates (N, T, T) of patches at pixels (N, 2) of an image as the current view shows them, less grey 128.
 
     They hold the window and the border that the gradient's 3x3 operator needs.
 
-    anchors (N,): the key of the image of each, one of the images. surfaces: points (N, 3) [m] at the patches' centres
-    and slopes (N, 2) of the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from
-    these. upper: the current panorama is the upper one. The templates' pixels are whole pixels of the current panorama,
-    which shows the centres at predicted (N, 2). Where a plane is seen edge on, the patch is not bent. KeyError for an
-    anchor without an image.
+    surfaces: points (N, 3) [m] at the patches' centres and slopes (N, 2) of the disparity there, both in the rectified
+    frame of the image; T_curr_ref (N, 4, 4) from it. upper: the current panorama is the upper one. The templates'
+    pixels are whole pixels of the current panorama, which shows the centres at predicted (N, 2). Where a plane is seen
+    edge on, the patch is not bent.
     """
     templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
-    if not len(pixels):
-        return templates
-    # All panoramas of a run have the same columns.
-    focal_px, centres = model.cylinder.focal_px, padded(images[int(anchors[0])], pixels)
     points, normals = np.ascontiguousarray(surfaces[0]), _normals(surfaces, model.baseline_m)
     shift = np.ascontiguousarray(np.rint(predicted) - predicted)
-    height_m = model.baseline_m if upper else 0.0
-    for key in np.unique(anchors).tolist():
-        image, chosen = images[key].image, np.flatnonzero(anchors == key)
-        patch_kernels.sample(image, chosen, centres, points, normals, T_curr_ref, height_m, shift, focal_px, templates)
+    height_m, focal_px = model.baseline_m if upper else 0.0, model.cylinder.focal_px
+    at = image.image, padded(image, pixels)
+    patch_kernels.sample(*at, points, normals, T_curr_ref, height_m, shift, focal_px, templates)
     return templates
 
 
@@ -171,10 +162,8 @@ def _in_upper(
 ) -> Floats:
     """Return templates of the lower panorama's patches at pixels (N, 2) as the upper one shows them at predicted."""
     points = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
-    anchors, identity = np.zeros(len(pixels), np.intp), np.tile(np.eye(4), (len(pixels), 1, 1))
-    return plane_templates(
-        {0: pair[0]}, anchors, pixels, (points, slopes), identity, model, predicted, upper=True, window_px=window_px
-    )
+    surfaces, identity = (points, slopes), np.tile(np.eye(4), (len(pixels), 1, 1))
+    return plane_templates(pair[0], pixels, surfaces, identity, model, predicted, upper=True, window_px=window_px)
 
 
 def align(

@@ -59,9 +59,7 @@ class PoseSearch:
         # Number of landmarks that are tracked at most.
         self._tracked = max(2 * limits.good_inliers, round(TRACKED_SHARE * limits.features))
 
-    def find(
-        self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array, exposure: Exposure
-    ) -> PoseEstimate | None:
+    def find(self, frame: StereoFrame, T_last: Array, T_predicted: Array, exposure: Exposure) -> PoseEstimate | None:
         """Return the best estimate from guesses of the pose, or the first good one; None: no landmarks were found.
 
         The guesses: the prediction, which nearly always is near; the prediction, searched with a pyramid; there, the
@@ -70,7 +68,7 @@ class PoseSearch:
         best: PoseEstimate | None = None
         for number in range(3):
             is_near = number == 0
-            T_guess = T_predicted if number < 2 else self._turned(frame, usable, T_last, T_predicted)
+            T_guess = T_predicted if number < 2 else self._turned(frame, T_last, T_predicted)
             estimate = self.estimate(frame, T_guess, exposure, is_near=is_near)
             if estimate is not None and (best is None or estimate.inliers > best.inliers):
                 best = estimate
@@ -78,13 +76,13 @@ class PoseSearch:
                 break
         return best
 
-    def _turned(self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array) -> Array:
+    def _turned(self, frame: StereoFrame, T_last: Array, T_predicted: Array) -> Array:
         """Return the predicted position, turned from the last pose by the yaw that keeps most landmarks (IV.F)."""
         assert self._map.last is not None
         before, now = self._map.last.panorama, frame.lower.panorama
         guesses = [
             se3.transform(T_last[:3, :3] @ se3.rotation_exp([0, 0, yaw_rad]), T_predicted[:3, 3])
-            for yaw_rad in correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
+            for yaw_rad in correlation_peaks(before, now, frame.usable, turn_px=frame.lower.period_px)
         ]
         tracks = [self._map.track(frame.lower, T_guess, max_count=LANDMARKS) for T_guess in guesses]
         return guesses[int(np.argmax([len(each.landmarks) / max(1, each.visible) for each in tracks]))]

@@ -78,8 +78,8 @@ def seen_at(points: Array, upper: bool) -> Array:
 
 
 def templates_of(surfaces: tuple[Array, Array], pixels: Array, seen: Array, *, upper: bool) -> NDArray[np.float32]:
-    T, keys = np.tile(T_CURR_REF, (len(pixels), 1, 1)), np.full(len(pixels), 7)
-    return 128 + plane_templates({7: panorama(np.eye(4))}, keys, pixels, surfaces, T, MODEL, seen, upper=upper)
+    T = np.tile(T_CURR_REF, (len(pixels), 1, 1))
+    return 128 + plane_templates(panorama(np.eye(4)), pixels, surfaces, T, MODEL, seen, upper=upper)
 
 
 @pytest.mark.parametrize("upper", [False, True])
