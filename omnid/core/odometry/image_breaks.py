@@ -54,8 +54,7 @@ LEAST: Final = 8  # flows on either side of a line in the cameras of a break
 LEAST_PART: Final = 0.2
 RIGHT_COST: Final = float(cost(VIEW))  # of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected
 FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
-# Unknowns of another motion, of a shift and a turn of the whole image, and of a shift, perhaps beyond a line.
-TORN, TURNED, DISPLACED = 6, 3, 2
+TORN, DISPLACED = 6, 3  # unknowns of another motion, and of a shift and a turn of the raw image
 
 
 class Break(NamedTuple):
@@ -65,7 +64,7 @@ class Break(NamedTuple):
     cameras: tuple[int, ...]  # 0: lower, 1: upper
     is_before: bool  # what is before the line is displaced, and not what is beyond
     line: float  # part of the raw image that is before the line; 0: the whole image is displaced
-    amount: Array  # (C, 2 or 3) raw px, and turn, rad; of torn images (1, 6): motion
+    amount: Array  # (C, 3) raw px, raw px, turn [rad]; of torn images (1, 6): motion
     gain: float  # logarithm of the likelihood ratio, less the cost of the parameters
     px: float  # by which what is beyond is displaced in view, mean
 
@@ -84,14 +83,14 @@ class Break(NamedTuple):
                 f"images of the {cameras} are torn at row {line}: what is below is of another moment than what is "
                 "above; check bandwidth and buffers, poses were degraded"
             )
-        u, v, turn_rad = np.append(self.amount.mean(axis=0), 0.0)[:3]
+        u, v, turn_rad = self.amount.mean(axis=0)
         part = f" {'above' if self.is_before else 'below'} row {line}" if line else ""
         if not line and len(self.cameras) == 1:
             part = f" against those of the {CAMERAS[1 - self.cameras[0]]} one"
-        turned = f" and turned by {math.degrees(turn_rad):+.2f} deg" if turn_rad else ""
         return (
-            f"images of the {cameras} were displaced by {u:+.1f}, {v:+.1f} px{turned}{part}: the rig does not fit "
-            "them; check the mirror, the sensor's window and the driver, poses were degraded"
+            f"images of the {cameras} were displaced by {u:+.1f}, {v:+.1f} px{part}, and turned by "
+            f"{math.degrees(turn_rad):+.2f} deg: the rig does not fit them; check the mirror, the sensor's window and "
+            "the driver, poses were degraded"
         )
 
 
@@ -269,10 +268,10 @@ def likeliest_break(flow: _Flow) -> Break | None:
     """Return the likeliest break that flows show beyond doubt; None: there is none."""
     left, outlier, unit = whole = flow.whole()
     all_gain = float(np.minimum((left**2).sum(axis=1), outlier).sum()) / unit
-    if all_gain < DECIDING_COST + _cost(2, len(flow.y)):
+    if all_gain < DECIDING_COST + _cost(DISPLACED, len(flow.y)):
         return None  # no break explains more than all that is left
     found: list[Break] = []
-    for size in (TORN, TURNED, DISPLACED):
+    for size in (TORN, DISPLACED):
         # The six unknowns of a motion fit some of many wrong depths.
         least = max(DECIDING_COST, LEAST_PART * all_gain * (size == TORN))
         each = (broken for cameras in SETS for broken in _candidates(flow, whole, size, cameras))
@@ -295,7 +294,7 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
     most_off = int(np.bincount(flow.camera[is_off], minlength=2).argmax())
     own = [flow.camera == camera for camera in cameras]
     # 1. A motion is one of both cameras, a displacement is one of each.
-    F, masks = (null[:, :, :size], [np.logical_or.reduce(own)]) if is_torn else (flow.shift[:, :, :size], own)
+    F, masks = (null[:, :, :size], [np.logical_or.reduce(own)]) if is_torn else (flow.shift, own)
     columns = np.concatenate([F * mask[:, None, None] for mask in masks], axis=2)
     # 2. Amounts to start from: of all flows, and of those that right images do not explain.
     starts = []
@@ -312,7 +311,7 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
         # 3. The likeliest line, of both sides; 0: the whole image.
         left = y - null @ start[:unknowns]
         extra = gains(left - columns @ start[unknowns:]) - gains(left)
-        for side, line in _likely_lines(flow.row, extra, own, size):
+        for side, line in _likely_lines(flow.row, extra, own, is_torn=is_torn):
             # One image displaced is the other one displaced the other way, and a step.
             if line == 0 and cameras == (1 - most_off,):
                 continue
@@ -326,19 +325,17 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
             yield Break(is_torn, cameras, side, line, solution[unknowns:].reshape(len(masks), -1), gain, px)
 
 
-def _likely_lines(row: Array, extra: Array, own: list[Flags], size: int) -> list[tuple[bool, float]]:
+def _likely_lines(row: Array, extra: Array, own: list[Flags], *, is_torn: bool) -> list[tuple[bool, float]]:
     """Return side and line, a part of the raw image, of the whole image (if it is not torn) and of the likeliest line.
 
     row, extra (N,): of each flow, its row and by how much likelier a break makes it; own: flags (N,) of each camera
     that may have the break.
     """
-    found, lines = [] if size == TORN else [(False, 0.0)], np.arange(1, LINES) / LINES
-    if size == TURNED:
-        return found
+    found, lines = [] if is_torn else [(False, 0.0)], np.arange(1, LINES) / LINES
     is_beyond = row >= lines[:, None]
     enough = np.ones(len(lines), bool)
     for each in own:
-        least = LEAST_PART * each.sum() if size == TORN else LEAST / len(own)
+        least = LEAST_PART * each.sum() if is_torn else LEAST / len(own)
         enough &= ((is_beyond & each).sum(axis=1) >= least) & ((~is_beyond & each).sum(axis=1) >= least)
     gains = np.where(enough, np.stack([is_beyond @ extra, ~is_beyond @ extra]), -np.inf)
     side, number = np.unravel_index(gains.argmax(), gains.shape)
@@ -348,9 +345,9 @@ def _likely_lines(row: Array, extra: Array, own: list[Flags], size: int) -> list
 def _cost(parameters: int, flows: int) -> float:
     """Return the penalty of a break with so many parameters by so many flows, and of the choice.
 
-    Chosen are side and line, one of three kinds, and cameras.
+    Chosen are side and line, one of two kinds, and cameras.
     """
-    return 0.5 * parameters * math.log(2 * flows) + math.log(2 * LINES * 3 * len(SETS))
+    return 0.5 * parameters * math.log(2 * flows) + math.log(2 * LINES * 2 * len(SETS))
 
 
 def _common(A: Array, y: Array) -> Array:

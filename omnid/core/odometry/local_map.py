@@ -142,36 +142,33 @@ class LocalMap:
         """Correct depths by the estimate that waits, with the velocity at it; None: no better one than was assumed."""
         if self._seen is not None:
             ids, estimate = self._seen
-            kept = np.isin(ids, self.table.id)
-            self._correct(np.searchsorted(self.table.id, ids[kept]), estimate, kept, velocity or estimate.assumed)
+            self._correct(ids, estimate, velocity or estimate.assumed)
         self._seen = None
 
     def accept(self, lower: PaddedPanorama, estimate: PoseEstimate) -> None:
         """Record the inliers of an accepted pose, and correct depths, at once or when the velocity is known."""
+        ids = self.table.id[estimate.landmarks]
         if estimate.by_motion.shape[1]:
-            self._seen = self.table.id[estimate.landmarks], estimate
+            self._seen = ids, estimate
         else:
-            self._correct(estimate.landmarks, estimate, np.ones(len(estimate.landmarks), bool), estimate.assumed)
+            self._correct(ids, estimate, estimate.assumed)
         self.update_tracked(lower, estimate.landmarks, estimate.pixels)
 
-    def _correct(self, rows: Indices, estimate: PoseEstimate, kept: Flags, velocity: RigVelocity) -> None:
-        """Correct depths of landmarks (rows of the table) by the views in an estimate that are kept (flags (M,))."""
+    def _correct(self, ids: Indices, estimate: PoseEstimate, velocity: RigVelocity) -> None:
+        """Correct the points of landmarks (ids (M,)) by their views in an estimate; those without upper row stay.
+
+        A Kalman update of each point in its anchor's frame, by the disparity alone: that depends on the depth, and
+        hardly on the error of the pose. The errors of one texture are correlated from frame to frame, so each variance
+        is enlarged.
+        """
+        kept = np.isin(ids, self.table.id) & np.isfinite(estimate.views[:, 2])
+        rows = np.searchsorted(self.table.id, ids[kept])
         J, views = estimate.by_motion[kept], estimate.views[kept]
         disparity = views[:, 2] - views[:, 1] + J @ (velocity.twist - estimate.assumed.twist)
         variance = estimate.variance[kept] + np.einsum("ni,ij,nj->n", J, velocity.covariance, J)
-        self.update_depths(rows, disparity, variance, estimate.T_odom_rect)
-
-    def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:
-        """Correct the points of landmarks (rows (M,) of the table) by disparities (M,) [px] measured at a pose.
-
-        variance (M,) [px^2] of the disparities; NaN disparities are ignored. A Kalman update of each point in its
-        anchor's frame, by the disparity alone: that depends on the depth, and hardly on the error of the pose. The
-        errors of one texture are correlated from frame to frame, so each variance is enlarged.
-        """
-        known = np.isfinite(disparity)
-        rows, disparity, variance = rows[known], disparity[known], variance[known]
         # 1. The disparity f t / r as predicted, and its derivatives by the point in the anchor.
-        T_curr_anchor, points = self.from_anchors(se3.inverse(T_odom_rect), rows), self.table.anchor_points[rows]
+        T_curr_anchor = self.from_anchors(se3.inverse(estimate.T_odom_rect), rows)
+        points = self.table.anchor_points[rows]
         P = self.table.anchor_covariance[rows]
         seen = (T_curr_anchor[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_curr_anchor[:, :3, 3]
         r2 = np.maximum((seen[:, :2] ** 2).sum(axis=1), MIN_RADIUS**2)

@@ -78,40 +78,31 @@ def located(
 
 def _has_wrong_period(pair: Pair, pixels: Array, rows: Array, known: Array, most_px: int) -> Flags:
     """Return flags (N,) of pixels (N, 2) with upper rows (N,) whose disparity, up to most_px, may be another one."""
-    disparities, own = np.arange(most_px + 1), rows - pixels[:, 1]
-    known = known[np.isfinite(known).all(axis=1)]
+    known, own, last = known[np.isfinite(known).all(axis=1)], rows - pixels[:, 1], len(pair[1].image) - 1
     if not len(pixels) or 0 < len(known) < NEIGHBOURS:
         return np.zeros(len(pixels), bool)
-    if not len(known):
-        repeated = _repeats(pair, pixels, own, np.ones((len(pixels), most_px + 1), bool), REACH_PX)
-        return np.asarray(repeated & (repeated.mean() > 1 - LEAST_UNIQUE_SHARE))
-    away = pair[0].wrap(pixels[:, :1] - known[:, 0]) ** 2 + (pixels[:, 1:] - known[:, 1]) ** 2
-    nearest = np.argpartition(away, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
-    around = np.median((known[:, 2] - known[:, 1])[nearest], axis=1)
-    differs = (own > OTHER_RATIO * around) | (around > OTHER_RATIO * own)
-    reach_px = np.ceil(SAME_SHARE * around)
-    tried = differs[:, None] & (np.abs(disparities - np.rint(around)[:, None]) <= reach_px[:, None])
-    is_beyond = pixels[:, 1] + around + reach_px > len(pair[1].image) - 1  # where a match cannot be excluded
-    return np.asarray(_repeats(pair, pixels, own, tried, 1) | (differs & is_beyond))
-
-
-def _repeats(pair: Pair, pixels: Array, own: Array, tried: Flags, own_px: int) -> Flags:
-    """Return flags (N,) of pixels (N, 2) that match as well at whole disparities that are tried (N, D) as at their own.
-
-    own_px: distance from their own within which it is the same match.
-    """
-    is_own = np.abs(np.arange(tried.shape[1]) - np.rint(own)[:, None]) <= own_px
-    tried = tried & ~is_own
+    # 1. Other disparities: all, or those of the known landmarks around where these differ. Where a match at theirs
+    #    would lie below the upper panorama it cannot be excluded.
+    if len(known):
+        away = pair[0].wrap(pixels[:, :1] - known[:, 0]) ** 2 + (pixels[:, 1:] - known[:, 1]) ** 2
+        nearest = np.argpartition(away, NEIGHBOURS - 1, axis=1)[:, :NEIGHBOURS]
+        around = np.median((known[:, 2] - known[:, 1])[nearest], axis=1)
+        reach_px, own_px = np.ceil(SAME_SHARE * around), 1
+        first, end = np.rint(around) - reach_px, np.rint(around) + reach_px + 1
+        wrong = (own > OTHER_RATIO * around) | (around > OTHER_RATIO * own)
+        compared = wrong & (pixels[:, 1] + around + reach_px <= last)
+    else:
+        first, end, own_px = np.zeros(len(pixels)), np.full(len(pixels), most_px + 1.0), REACH_PX
+        wrong = compared = np.ones(len(pixels), bool)
+    # 2. The best correlations of the patch at its own and at the others.
     lower, _ = normalised_patches(pair[0], np.rint(pixels), SIDE_PX)
-    # 1. The correlations.
-    scores = np.full(tried.shape, -1.0, np.float32)
-    compared = (tried | is_own) & tried.any(axis=1, keepdims=True)
-    for part in np.array_split(np.argwhere(compared), 1 + int(compared.sum()) // len(pixels)):
-        there = np.rint(pixels[part[:, 0]])
-        there[:, 1] += part[:, 1]
-        upper, _ = normalised_patches(pair[1], there, SIDE_PX)
-        is_inside = there[:, 1] < len(pair[1].image)
-        scores[tuple(part.T)] = np.where(is_inside, (lower[part[:, 0]] * upper).sum(axis=1), -1.0)
-    # 2. The best one near the own disparity, and the best one elsewhere.
-    at_own, elsewhere = (np.where(flags, scores, -1.0).max(axis=1) for flags in (is_own, tried))
-    return np.asarray(tried.any(axis=1) & (elsewhere > at_own - LEAST_LEAD))
+    for n in np.flatnonzero(compared):
+        at_own = np.rint(own[n]) + np.arange(-own_px, own_px + 1)
+        elsewhere = np.setdiff1d(np.arange(first[n], end[n]), at_own)
+        scores = []
+        for disparities in (at_own, elsewhere):
+            there = np.rint(pixels[n]) + np.outer(disparities, [0.0, 1.0])
+            upper, _ = normalised_patches(pair[1], there[there[:, 1] <= last], SIDE_PX)
+            scores.append((lower[n] * upper).sum(axis=1).max(initial=-1.0))
+        wrong[n] = len(elsewhere) > 0 and scores[1] > scores[0] - LEAST_LEAD
+    return np.asarray(wrong & (len(known) > 0 or wrong.mean() > 1 - LEAST_UNIQUE_SHARE))

@@ -1,7 +1,6 @@
 """Kanade-Lucas-Tomasi tracking on panoramas, of which a full turn wraps around, with the forward-backward check.
 
-Below it: normalised correlation of windows, and turns between two panoramas, by circular correlation and by the paper's
-steps (Dang et al. 2012, IV.F).
+Below it: normalised correlation of windows, and turns between two panoramas by circular correlation.
 """
 
 from __future__ import annotations
@@ -78,15 +77,6 @@ def flow(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt:
 def padded(panorama: PaddedPanorama, pixels: Array) -> Array:
     """Return pixels (N, 2) of the padded image."""
     return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])
-
-
-def steps() -> list[float]:
-    """Return the paper's yaw hypotheses [rad] in order of magnitude: 0, 18, -18, 36, -36, ... 162, -162, 180 degrees.
-
-    The paper counts from 0 to 342 degrees, and so tries a small turn to the right last.
-    """
-    both = [sign * k * STEP_RAD for k in range(1, 10) for sign in (1, -1)]
-    return [0.0, *both, 10 * STEP_RAD]
 
 
 def normalised_patches(

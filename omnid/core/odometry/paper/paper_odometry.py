@@ -21,7 +21,7 @@ from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter,
 from omnid.core.odometry.pose_estimation import consensus, rigid_fit
 from omnid.core.odometry.pose_search import MIN_LANDMARKS
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import KltSettings, flow, steps, track
+from omnid.core.odometry.tracking import STEP_RAD, KltSettings, flow, track
 from omnid.core.stereo.triangulation import triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
@@ -183,12 +183,21 @@ def refine(
     return register(X_a[is_inlier], X_b[is_inlier])
 
 
+def steps() -> list[float]:
+    """Return the paper's yaw hypotheses [rad] in order of magnitude: 0, 18, -18, 36, -36, ... 162, -162, 180 degrees.
+
+    The paper counts from 0 to 342 degrees, and so tries a small turn to the right last.
+    """
+    both = [sign * k * STEP_RAD for k in range(1, 10) for sign in (1, -1)]
+    return [0.0, *both, 10 * STEP_RAD]
+
+
 def turned_track(
     previous: StereoFrame, frame: StereoFrame, features: Array, klt: KltSettings, turns: Sequence[float] | None = None
 ) -> tuple[Array, Flags]:
     """Track features (N, 2) with the improved KLT of section IV.F: rotate image k+1 until enough of them are found.
 
-    turns [rad]: the hypotheses in the order in which they are tried; by default 0, 18, -18, 36, -36, ... degrees.
+    turns [rad]: the hypotheses in the order in which they are tried; None: those of the paper.
 
     The paper stops at the first turn that will do; but half a step away half of the features may be found as well, so
     the search goes on while the next larger turn, to the left or to the right, finds more. If no turn finds enough,
