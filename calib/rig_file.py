@@ -69,7 +69,7 @@ INTRINSICS: Final[Mapping[str, type[Struct]]] = {
 
 
 class MaskTable(Struct, frozen=True):
-    """The ring between two circles, and an image of the camera's size: embedded, or the name of a file."""
+    """The ring between two circles, and an embedded image of the camera's size."""
 
     center: tuple[float, float]
     inner_px: float = 0.0
@@ -112,20 +112,20 @@ class RigTable(Struct, frozen=True):
 
 # 2. Reading.
 def read_rig(path: str | os.PathLike[str]) -> Rig:
-    """Read the rig of a `rig.toml`; a mask's image is read from the same folder. CalibError says what to do."""
+    """Read the rig of a `rig.toml`. CalibError says what to do."""
     path = Path(path)
     if not path.exists():
         raise CalibError(f"{path}: there is no such rig: `omnid calibrate import` or `omnid calibrate rig` makes one")
-    return parse_rig(read_bytes(path), path.parent, str(path))
+    return parse_rig(read_bytes(path), str(path))
 
 
-def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
-    """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
+def parse_rig(text: str | bytes, name: str = "rig.toml") -> Rig:
+    """Parse the rig of a `rig.toml`'s text."""
     with within(f"{name}: "):
         values = table_of(text.encode() if isinstance(text, str) else text)
         _require_version("schema", values.get("schema"), SCHEMA)  # first, as another one has other keys
         table = convert(RigTable, values)
-        lower, upper = (_mounted(side, getattr(table, side), folder) for side in SIDES)
+        lower, upper = (_mounted(side, getattr(table, side)) for side in SIDES)
         return Rig(
             lower,
             upper,
@@ -141,7 +141,7 @@ def _require_version(key: str, found: object, version: int) -> None:
         raise CalibError(f"{key}: expected version {version}, found {'nothing' if found is None else shown(found)}")
 
 
-def _mounted(side: str, table: CameraTable, folder: Path | None) -> MountedCamera:
+def _mounted(side: str, table: CameraTable) -> MountedCamera:
     """Return the camera of a table."""
     T_rig_cam, other = table.T_rig_lower, table.T_rig_upper
     if side == "upper":
@@ -154,7 +154,7 @@ def _mounted(side: str, table: CameraTable, folder: Path | None) -> MountedCamer
     intrinsics = convert(INTRINSICS[table.model], table.intrinsics, (side, "intrinsics"))
     with within(f"{side}.intrinsics: "):
         camera = _camera(table, intrinsics)
-    mask = None if table.mask is None else _mask(f"{side}.mask", table.mask, table.size, folder)
+    mask = None if table.mask is None else _mask(f"{side}.mask", table.mask, table.size)
     return MountedCamera(camera, se3.inverse(transform_of(T_rig_cam, f"{side}.T_rig_{side}")), mask)
 
 
@@ -169,26 +169,23 @@ def _camera(table: CameraTable, i: Struct) -> OmniCamera:
     return camera_of("ocam", values, table.size, table.view or "mirror", distance_m)
 
 
-def _mask(path: str, table: MaskTable, size: Size, folder: Path | None) -> Mask:
+def _mask(path: str, table: MaskTable, size: Size) -> Mask:
     outer_px = np.inf if table.outer_px is None else table.outer_px
     if not 0 <= table.inner_px < outer_px:
         raise CalibError(f"{path}.inner_px: expected 0 <= inner_px < outer_px, found {table.inner_px:g}")
     with within(f"{path}.image: "):
-        image = None if table.image is None else _mask_image(table.image, size, folder)
+        image = None if table.image is None else _mask_image(table.image, size)
     return Mask(table.center, table.inner_px, float(outer_px), image)
 
 
-def _mask_image(source: str, size: Size, folder: Path | None) -> NDArray[np.uint8]:
+def _mask_image(source: str, size: Size) -> NDArray[np.uint8]:
     """Return the image of a mask (H, W), whose size is that of the camera's images."""
-    if source.startswith(EMBEDDED):
-        try:
-            data = base64.b64decode(source[len(EMBEDDED) :], validate=True)
-        except (binascii.Error, ValueError):
-            raise CalibError("expected base64 after its prefix") from None
-    elif folder is None or "\0" in source:
-        raise CalibError("expected an embedded image, because there is no folder to read a file from")
-    else:
-        data = read_bytes(folder / source)
+    if not source.startswith(EMBEDDED):
+        raise CalibError(f"expected an embedded image, which begins with {EMBEDDED}")
+    try:
+        data = base64.b64decode(source[len(EMBEDDED) :], validate=True)
+    except (binascii.Error, ValueError):
+        raise CalibError("expected base64 after its prefix") from None
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     except cv2.error:

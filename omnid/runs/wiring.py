@@ -63,7 +63,7 @@ def attached_rig(reader: LogReader, log: object) -> Rig:
             f"{log}: no rig.toml is attached to the log; give one with --rig, made by `omnid calibrate "
             "import camchain.yaml -o rig.toml`"
         )
-    return parse_rig(attached, None, f"{log}: attached rig.toml")
+    return parse_rig(attached, f"{log}: attached rig.toml")
 
 
 def run_to_end(graph: Graph, run_places: RunPlaces) -> None:

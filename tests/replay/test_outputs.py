@@ -235,7 +235,7 @@ def test_a_recording_holds_all_messages_rig_and_settings(recording: Path, messag
     reader.close()
     settings = tomllib.loads(attached["omnid.toml"].decode())
     assert settings["record"]["enabled"] and settings["motor"]["port"].endswith("motor")
-    ours, theirs = parse_rig(attached["rig.toml"]), parse_rig((scene / "rig.toml").read_bytes(), scene)
+    ours, theirs = parse_rig(attached["rig.toml"]), parse_rig((scene / "rig.toml").read_bytes())
     assert rig_toml(ours).splitlines()[:30] == rig_toml(theirs).splitlines()[:30]
     assert any(message.content.twist.linear.x > 0.1 for message in of(messages, "/omnid/drive")), "it drove"
     assert any(message.content.width > 100 for message in of(messages, "/omnid/cloud")), "there is a map"
