@@ -2,7 +2,7 @@
 
 - Kalibr: p_cam = T_cam_imu @ p_imu, p_cam1 = T_cn_cnm1 @ p_cam0, t_imu = t_cam + timeshift_cam_imu. T_cam_imu is taken
   for T_cam_rig.
-- OCamCalib: one calib_results.txt for each camera; the transform between two has a file of its own, or is straight up.
+- OCamCalib: one calib_results.txt for each camera; the upper one is straight above the lower one.
 - Stitched images of two 360-degree cameras: their size and baseline are all there is.
 """
 

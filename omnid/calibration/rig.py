@@ -149,7 +149,7 @@ def _masked_rig(found: RigCalibration, images: PairedImages) -> tuple[Rig, list[
         mounted.append(replace(camera, mask=mask))
         if mask is None and not sees_directly(camera.camera):
             warnings.append(
-                f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
-                f"add [{name}.mask] by hand"
+                f"no rim of a mirror was found in the {name} camera's images: find it in a log by `omnid calibrate "
+                f"drive LOG --only mask`, or add [{name}.mask] by hand"
             )
     return replace(rig, lower=mounted[0], upper=mounted[1]), warnings
