@@ -20,7 +20,6 @@ from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
-from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
@@ -42,7 +41,7 @@ def collect(log: Path, rig: Rig, cameras: LogCameras, config: Config) -> tuple[D
     since = 0  # pairs since the last keyframe
     with closing(LogReader(log, cameras, place.rig.topics)) as reader:
         min_pairs = max(1, -(-(reader.pair_estimate() or 0) // MAX_KEYFRAMES))
-        for update in tracked_updates(reader, front_end, config, log):
+        for update in tracked_updates(reader, front_end, log):
             # 1. Choose the poses that are far enough apart to add information.
             T_odom_rig, since = update.T_odom_rig, since + 1
             if T_rig_odom:
@@ -70,9 +69,9 @@ def collect(log: Path, rig: Rig, cameras: LogCameras, config: Config) -> tuple[D
     return state, observations
 
 
-def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log: Path) -> Iterator[OdometryUpdate]:
+def tracked_updates(reader: LogReader, front_end: FrontEnd, log: Path) -> Iterator[OdometryUpdate]:
     """Yield the poses of a log; OmnidError where the rig cannot be that of its cameras."""
-    pairing, health = Synchronise(front_end.geometry.rig, config.pair), front_end.health
+    pairing, health = front_end.pairing, front_end.health
     for pair in filter(None, map(pairing.process, reader.frames())):
         update = front_end.pose(pair)
         if health.state is RigState.EXCHANGED:

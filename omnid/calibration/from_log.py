@@ -141,7 +141,7 @@ def calibrate_mask(
     place = geometry(with_masks(log, rig, cameras), config.panorama)
     front_end, parts = FrontEnd(place, config), FixedParts(place.cylinder)
     with closing(LogReader(log, cameras, rig.topics)) as reader:
-        for update in tracked_updates(reader, front_end, config, log):
+        for update in tracked_updates(reader, front_end, log):
             pair = update.depth.panoramas
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:
                 parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)

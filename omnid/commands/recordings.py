@@ -222,8 +222,7 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
         for topic in (ODOMETRY, SCAN, PANORAMA, STATUS, CLOUD):
             robot.on_message(state.put, topic, kept=topic in (STATUS, CLOUD))
         while time.monotonic() < end_s and not signals:
-            _, content = state.next(0.5) or (None, None)
-            if content is not None:
+            if (content := state.next(0.5)) is not None:
                 sink.draw(content)
     if not sink.poses:
         options.failed(f"no pose of {config.bus.robot} came: `omnid listen` names those that are there")

@@ -76,15 +76,14 @@ class RobotState:
         """True if a message waits."""
         return bool(self._inbox or self._newest)
 
-    def next(self, timeout_s: float) -> tuple[ReceivedMessage, Any] | None:
-        """Process the oldest message of the inbox; return it and its content, or None after the timeout."""
+    def next(self, timeout_s: float) -> Any:
+        """Process the oldest message that waits; return its content, None after the timeout or for unreadable bytes."""
         end_s = time.monotonic() + timeout_s
         while not self.is_waiting:
             if time.monotonic() >= end_s:
                 return None
             time.sleep(PERIOD_S)
-        message = self._inbox.popleft() if self._inbox else self._newest.popitem()[1]
-        return message, self.process(message)
+        return self.process(self._inbox.popleft() if self._inbox else self._newest.popitem()[1])
 
     def process(self, message: ReceivedMessage) -> Any:
         """Return the content of a message, whose pose or status is kept; None, and count it, where it is unreadable."""

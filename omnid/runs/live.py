@@ -184,7 +184,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     if config.bus.panorama_hz:
         graph.sink("panorama", PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns), poses, thread=BACKGROUND)
     if config.record.enabled:
-        recorder = open_recorder(config, rig_toml(rig), clock, session.encoder(rig, clock.segment_unix_ns))
+        recorder = open_recorder(config, rig_toml(rig), clock, session.encoder(rig))
         session.outputs.callback(recorder.close)
         session.parts[names.RECORDING] = recorder.stats
         images: Sequence[Stream[Any]] = [pairs] if config.record.images_hz else frames

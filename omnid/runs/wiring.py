@@ -38,7 +38,7 @@ from omnid.messages import (
 from omnid.runs.files import RouteFiles, RunPlaces
 from omnid.settings import dump
 from omnid.sinks.drive import LiveDrive, arming_answers, navigation_answers, send_scan, send_setpoint
-from omnid.sinks.encoder import Encoder, UnixTime
+from omnid.sinks.encoder import Encoder
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.mapping import MapGrid, Mapping, Places
@@ -145,10 +145,10 @@ class Session:
         self.outputs.callback(link.close)
         return link
 
-    def encoder(self, rig: Rig, unix_ns: UnixTime | None = None) -> Encoder:
-        """Return the encoder of the messages that leave the run; unix_ns: None for that of the clock."""
+    def encoder(self, rig: Rig) -> Encoder:
+        """Return an encoder of the messages that leave the run."""
         scan_range_m = self.config.obstacles.scan.max_range_m
-        return Encoder(rig.T_base_rig, CLOUD_POINTS, unix_ns or self.clock.unix_ns, rig, scan_range_m)
+        return Encoder(rig.T_base_rig, CLOUD_POINTS, self.clock.unix_ns, rig, scan_range_m)
 
 
 @dataclass(frozen=True, slots=True)

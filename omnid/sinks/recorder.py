@@ -65,13 +65,15 @@ class Recorder:
         clock: RobotClock | None = None,
         images_hz: float = 0.0,
     ) -> None:
-        """clock: of the stamps, None: they are Unix time; the encoder was made with its segment_unix_ns.
+        """clock: of the stamps, None: they are Unix time. encode: takes the time of each file from now on.
 
         images_hz: pairs per second whose images are recorded; 0: all. Single images are always recorded.
         """
         self._log, self._robot, self._encode = log, robot, encode
         self._clock = clock or log_time()
         self._steps = self._clock.steps
+        if encode is not None:
+            encode.unix_ns = self._clock.segment_unix_ns
         self._period_ns, self._period_index = round(NS_PER_S / images_hz) if images_hz else 1, -1
         self._file_count = 0
 

@@ -128,8 +128,8 @@ class RobotFeed:
     def process_inbox(self) -> None:
         """Process what has come; forget the statuses of a daemon that has ended."""
         before, has_news = self.state.pose, False
-        while (received := self.state.next(0.0)) is not None:
-            match received[1]:
+        while self.state.is_waiting:
+            match self.state.next(0.0):
                 case Pose() as pose:
                     # Another run has another odom, for which the pages load again.
                     if before is not None and pose.attachment.run != before.attachment.run:

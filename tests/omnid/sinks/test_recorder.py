@@ -103,7 +103,7 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
     of_run = set_clock()
-    encode = Encoder(np.eye(4), 100, of_run.segment_unix_ns)
+    encode = Encoder(np.eye(4), 100)
     recorder = open_recorder(settings(tmp_path / "log"), "version = 1", encode=encode, clock=of_run)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
@@ -146,7 +146,7 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
     computer = SetClock(OFFSET_NS)
     computer.advance(5.0)
     of_run = computer.clock()
-    encode = Encoder(np.eye(4), 0, of_run.segment_unix_ns)
+    encode = Encoder(np.eye(4), 0)
     monkeypatch.setattr(
         RecordConfig, "rotation", lambda _: RotationSettings(file_bytes=10**6, keep_bytes=10**6 + 65_000, free_bytes=0)
     )
