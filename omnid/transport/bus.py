@@ -144,8 +144,8 @@ class Bus:
         topics = [name for name in PUBLISHED if gives_time or name != CLOCK]
         self._node = ros2.RosNode(session, config.robot, config.ros2_domain, is_on=config.ros2 != "off")
         self._publishers = {name: TopicPublisher(session, config, name, self._node) for name in topics}
-        self._newest: dict[str, tuple[bytes, bytes | None]] = {}  # payload and attachment of latched topics
-        self._texts: dict[str, str | Callable[[], str]] = {}  # answers to queries, by name
+        # Answers to queries, by name: a message or a text, or what returns it at the moment; attachment, encoding.
+        self._kept: dict[str, tuple[bytes | str | Callable[[], str], bytes | None, zenoh.Encoding]] = {}
         self._queries = {name: self._queryable(name) for name in topics if PUBLISHED[name].latched}
         self._rings: list[Ring] = []  # of commands; those of requests to arm and of stops are the last ones
         self._ids = count(1)
@@ -171,7 +171,7 @@ class Bus:
         attachment: zenoh attachment for subscribers that know omnid. A topic with a leading '/' has no robot's name.
         """
         if PUBLISHED[topic].latched:
-            self._newest[topic] = (payload, attachment)
+            self._kept[topic] = payload, attachment, zenoh.Encoding.APPLICATION_CDR
         try:
             self._publishers[topic].put(payload, attachment)
         except zenoh.ZError as error:
@@ -183,7 +183,7 @@ class Bus:
 
     def serve(self, name: str, text: str | Callable[[], str]) -> None:
         """Answer queries for `<robot>/<name>` with a text, such as the configuration, or with that of the moment."""
-        self._texts[name] = text
+        self._kept[name] = text, None, zenoh.Encoding.TEXT_PLAIN
         self._queries[name] = self._queryable(name)
 
     def subscribe_commands(
@@ -272,11 +272,9 @@ class Bus:
                 query.reply(query.key_expr, json.dumps(answer._asdict()), encoding=zenoh.Encoding.APPLICATION_JSON)
         for name, ring in list(self._queries.items()):
             for query in ring.messages():
-                if (text := self._texts.get(name)) is not None:
-                    query.reply(ring.key, text if isinstance(text, str) else text(), encoding=zenoh.Encoding.TEXT_PLAIN)
-                elif name in self._newest:
-                    payload, attachment = self._newest[name]
-                    query.reply(ring.key, payload, encoding=zenoh.Encoding.APPLICATION_CDR, attachment=attachment)
+                if name in self._kept:
+                    kept, attachment, encoding = self._kept[name]
+                    query.reply(ring.key, kept() if callable(kept) else kept, encoding=encoding, attachment=attachment)
 
     def _take_commands(self) -> None:
         """Pass on what has come. Of a stop and a request to arm in one pass the stop wins.
