@@ -251,8 +251,15 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         in_map = np.array(corrected, float).reshape(-1, 4, 4)
         live = np.array([each.T_map_rig for each in updates], float).reshape(-1, 4, 4)
         if options.map_tum and places is not None:
-            stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
-            warnings += write_trajectory(options.map_tum, stamps_ns, in_map, places.known(updates))
+            stamps_ns, known = np.array([each.stamp_ns for each in updates], np.int64), places.known(updates)
+            if not known.all():
+                warnings.append(
+                    f"{options.map_tum}: {len(known) - known.sum()} of {len(known)} poses are left out: no place of "
+                    "the map was recognised there, so it is not known where in it they are"
+                )
+            if updates:  # The file of an earlier run must not pass for the result.
+                options.map_tum.write_bytes(b"")
+            write_trajectory(options.map_tum, stamps_ns[known], in_map[known])
         return RunResult(
             np.array(kept_stamps_ns, np.int64),
             np.array(kept_poses, np.float64).reshape(-1, 4, 4),

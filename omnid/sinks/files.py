@@ -84,30 +84,14 @@ class TrajectoryFile:
             self._file.close()
 
 
-def write_trajectory(
-    path: Path,
-    stamps_ns: NDArray[np.int64],
-    poses: NDArray[np.float64],
-    known: NDArray[np.bool_] | None = None,
-) -> list[str]:
-    """Write poses (N, 4, 4) as TUM; return warnings. known (N,): of poses in a map, those to be written; None: all.
-
-    Without poses an existing file stays as it is. Raises OmnidError.
-    """
-    known = np.ones(len(stamps_ns), bool) if known is None else known
+def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    """Write poses (N, 4, 4) as TUM; without poses an existing file stays as it is. Raises OmnidError."""
     file = TrajectoryFile(path)
-    if len(known) and not known.any():  # The file of an earlier run must not pass for the result.
-        path.write_bytes(b"")
     try:
-        for stamp_ns, T, is_known in zip(stamps_ns.tolist(), poses, known, strict=True):
-            if is_known:
-                file.write(stamp_ns, T)
+        for stamp_ns, T in zip(stamps_ns.tolist(), poses, strict=True):
+            file.write(stamp_ns, T)
     finally:
         file.finish()
-    if known.all():
-        return []
-    left_out = f"{len(known) - known.sum()} of {len(known)} poses are left out"
-    return [f"{path}: {left_out}: no place of the map was recognised there, so it is not known where in it they are"]
 
 
 def write_plan(

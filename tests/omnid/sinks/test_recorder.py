@@ -191,7 +191,7 @@ def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: p
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", clock=set_clock(), encode=Encoder(np.eye(4), 0))
     for n in range(30):
-        recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
+        recorder.process(replace(odometry(n), stamp_ns=5 * 10**9 + n * 10**8))
     recorder.close()
     files = recorded(tmp_path / "log")
     assert len(files) == 3
