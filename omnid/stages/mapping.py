@@ -16,7 +16,7 @@ from omnid.core.mapping.voxel_map import ThinnedPath, VoxelMap
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.localisation import MapLocaliser, OdometryFrame
+from omnid.core.places.localisation import SEARCHES, MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.messages import DensePoints, GridUpdate, MapKeyframes, MapUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.stages.geometry import DenseDepths, Geometry
@@ -144,6 +144,7 @@ class Places:
         self._obstacles = Obstacles(geometry, config.obstacles)  # seen at keyframes
         self._T_floor_rig = floor_frame(geometry.rig, self._limits.floor_m)
         self.state = MapState.ODOMETRY_ONLY  # state of the newest pose
+        self._warning = ""  # about a saved map of which nothing is recognised
         self.counts = self._localiser.counts  # sizes and counters of the map
         self._copied_scans: object = None  # scans of the map at the last copy of counts and keyframes
         self._keyframes: MapKeyframes | None = None
@@ -158,6 +159,8 @@ class Places:
         # 1. The pose in the map.
         pose = self._localiser.process(self._frame(odometry))
         self.state = pose.state
+        is_unrecognised = not pose.is_known and self._localiser.failed >= SEARCHES
+        self._warning = "no place of the map is recognised: is the robot where it was made?" if is_unrecognised else ""
         # 2. Copies for other threads, which never read the map itself.
         scans = self._localiser.scans()
         if self._keyframes is None or scans is not self._copied_scans:
@@ -183,7 +186,7 @@ class Places:
 
     def stats(self) -> dict[str, object]:
         """Return the state of the pose in the map, and the sizes and counters of the map."""
-        return {"state": self.state, **self.counts}
+        return {"state": self.state, **self.counts, "_warning": self._warning}
 
     def corrected(self, update: PlaceUpdate) -> Array:
         """Return T_map_rig (4, 4) of an earlier pose by the present map; unchanged if its keyframe was dropped."""

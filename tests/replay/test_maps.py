@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +151,15 @@ def test_a_live_run_extends_its_map_now_and_then_and_at_its_end(scene: Path, oma
         code, err = daemon.end()
         assert code == 0 and "Traceback" not in err, err
     assert sessions(omap) == {0, 1, 2}
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_live_run_elsewhere_warns_that_no_place_is_recognised(elsewhere: Path, omap: Path) -> None:
+    port = free_port()
+    with started(command_line(elsewhere, port, None, "--map", omap, "--set", "obstacles.enabled=false"), port):
+        wait_until(lambda: answers(port), "the bus")
+        with closing(Operator(port)) as operator:
+            wait_until(lambda: "where the map was made" in operator.values("places").get(Key.REMEDY, ""), "the warning")
 
 
 @pytest.fixture(scope="module")

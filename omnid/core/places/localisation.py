@@ -150,7 +150,7 @@ class MapLocaliser:
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
         self._last_T: Array | None = None
         self._searched: tuple[int, Array] | None = None  # stamp and T_odom_rect of the last search
-        self._failed = 0  # searches of this part of the map that found nothing
+        self.failed = 0  # searches in a row, in this part of the map, that found nothing
         self._part: frozenset[int] | None = None  # keyframes that links join to the newest one; None: not known
         self._scans: KeyframeScans | None = None  # of this part; None: it has changed
 
@@ -238,7 +238,7 @@ class MapLocaliser:
             self._resets, self.search.contradicted = frame.resets, 0
             self._hypotheses.clear()
             self._newest = self._recognised_at = self._searched = None
-            self._failed = 0
+            self.failed = 0
             self._map_changed()
             self.correction.forget()
 
@@ -264,7 +264,7 @@ class MapLocaliser:
         searched_ns, T_odom_searched = self._searched
         if frame.stamp_ns - searched_ns < self._period_ns:
             return False
-        if self._failed < SEARCHES and self._recognised_at is None and self._elsewhere():
+        if self.failed < SEARCHES and self._recognised_at is None and self._elsewhere():
             return True
         moved_m, turned_rad = motion_between(T_odom_searched, frame.T_odom_rect)
         is_pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
@@ -278,9 +278,9 @@ class MapLocaliser:
         if found is None and (elsewhere := self._elsewhere()):
             found = self.search.find(small, features, self.places, elsewhere)
         if found is not None:
-            self._failed = 0
+            self.failed = 0
         elif len(features.views) >= MIN_MATCHES:  # it was not too dark to search
-            self._failed += 1
+            self.failed += 1
         return found
 
     def _expected(self, frame: OdometryFrame) -> Expected:
