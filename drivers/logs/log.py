@@ -18,9 +18,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from drivers.errors import RecordError
-from drivers.frame import Frame
-from drivers.logs.ros_messages import STAMPED_TYPES, header_stamp, parse_image, parse_motion
-from drivers.motion import MotionSample
+from drivers.logs.ros_messages import STAMPED_TYPES, header_stamp
 
 # Bounds of what is kept in memory, whatever a file states.
 MAX_RECORD_BYTES: Final = 256 * 2**20  # of a message, of an image and of an unpacked chunk
@@ -82,19 +80,11 @@ class LogFile(ABC):
 
 @dataclass(frozen=True, slots=True)
 class LoggedMessage:
-    """A message as it was logged; what reads it raises FrameDecodeError where it is invalid."""
+    """A message as it was logged."""
 
     topic: str
     kind: str  # ROS type such as sensor_msgs/msg/Image; "" where the message cannot be decoded
     data: memoryview  # CDR
-
-    def image(self) -> Frame:
-        """Return the image of an image message, see `parse_image`."""
-        return parse_image(self.kind, self.data)
-
-    def motion(self) -> MotionSample:
-        """Return the sample of wheels or an IMU."""
-        return parse_motion(self.kind, self.data)
 
 
 class Log:

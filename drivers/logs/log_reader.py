@@ -28,7 +28,7 @@ from drivers.logs.bags import Ros1Bag, SqliteBag
 from drivers.logs.image_folder import ImageFolder, image_folders
 from drivers.logs.log import Log, LogFile, listed
 from drivers.logs.mcap_file import McapFile
-from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, ODOMETRY
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, ODOMETRY, parse_image, parse_motion
 from drivers.motion import MotionSample
 
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
@@ -309,11 +309,12 @@ class LogReader:
             camera = cameras.get(message.topic)
             try:
                 if camera is None:
-                    sample = message.motion()
+                    sample = parse_motion(message.kind, message.data)
                     used.update([message.topic] if stamp_ns >= first_ns else [])
                     yield replace(sample, stamp_ns=stamp_ns)
                     continue
-                image = replace(message.image(), stamp_ns=stamp_ns, camera=camera, bits=self._cameras.bits)
+                image = parse_image(message.kind, message.data)
+                image = replace(image, stamp_ns=stamp_ns, camera=camera, bits=self._cameras.bits)
             except FrameDecodeError as error:
                 counter = "broken" if camera else "broken_motion"
                 self.counts[counter] += 1

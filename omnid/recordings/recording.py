@@ -16,7 +16,7 @@ from drivers.errors import FrameDecodeError
 from drivers.frame import Frame
 from drivers.logs.log import listed
 from drivers.logs.log_reader import open_log
-from drivers.logs.ros_messages import IMAGE_TYPES
+from drivers.logs.ros_messages import IMAGE_TYPES, parse_image
 from omnid.errors import OmnidError
 from omnid.transport.codec import (
     ODOMETRY_SCHEMA,
@@ -99,7 +99,7 @@ class RecordingReader:
             content: Content
             try:
                 if name in IMAGES and message.kind in IMAGE_TYPES:
-                    content = message.image()
+                    content = parse_image(message.kind, message.data)
                 elif decode is not None and message.kind == kind:
                     content = decode(bytes(message.data))
                 else:
