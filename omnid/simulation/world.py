@@ -25,7 +25,6 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, Struct
-from msgspec.structs import asdict
 
 from calib import se3
 from calib.models.camera import Array
@@ -42,26 +41,22 @@ class Person:
     """A box of a person's size that walks along a path and faces ahead."""
 
     faces: tuple[Rectangle, ...]  # in a frame on the floor below the middle, x ahead
-    path: tuple[Point, ...]  # m
-    speed_mps: float
-    repeat: str = "once"  # once | loop | back and forth
-    start_s: float = 0.0
-    starts_within_m: float = 0.0  # waits until the robot is this near to the last point of the path; 0: does not wait
+    walk: Walker
     rests_s: tuple[float, ...] = ()  # at the points of a path that is walked once; none: does not rest
 
     def place(self, walked_s: float) -> tuple[float, float, float]:
         """Return x, y [m] and heading [rad] after a time of walking."""
-        points = np.array(self.path)
+        points = np.array(self.walk.path)
         reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-        along_m, back, total_m = self.speed_mps * max(walked_s, 0.0), False, float(reached_m[-1])
+        along_m, back, total_m = self.walk.speed_mps * max(walked_s, 0.0), False, float(reached_m[-1])
         if self.rests_s:
             rested_s = np.cumsum(self.rests_s)
-            arrives_s = reached_m / self.speed_mps + rested_s - self.rests_s
+            arrives_s = reached_m / self.walk.speed_mps + rested_s - self.rests_s
             times_s = np.column_stack([arrives_s, arrives_s + self.rests_s]).ravel()
             along_m = float(np.interp(walked_s, times_s, np.repeat(reached_m, 2)))
-        if self.repeat != "once" and total_m > 0.0:
+        if self.walk.repeat != "once" and total_m > 0.0:
             laps, along_m = divmod(along_m, total_m)
-            back = self.repeat == "back and forth" and laps % 2 == 1
+            back = self.walk.repeat == "back and forth" and laps % 2 == 1
         along_m = min(along_m, total_m)
         along_m = total_m - along_m if back else along_m
         part = min(int(np.searchsorted(reached_m[1:], along_m)), len(points) - 2)
@@ -75,15 +70,17 @@ class Walkers:
 
     def __init__(self, people: tuple[Person, ...]) -> None:
         self._people = people
-        self._started_s: list[float | None] = [None if person.starts_within_m else person.start_s for person in people]
+        self._started_s: list[float | None] = [
+            None if person.walk.starts_within_m else person.walk.start_s for person in people
+        ]
         self.time_s = 0.0
 
     def advance(self, time_s: float, robot: Point) -> None:
         """Set the time, with the robot at a point [m]."""
         self.time_s = time_s
-        for number, person in enumerate(self._people):
-            is_near = math.dist(robot, person.path[-1]) <= person.starts_within_m
-            if self._started_s[number] is None and time_s >= person.start_s and is_near:
+        for number, walk in enumerate(person.walk for person in self._people):
+            is_near = math.dist(robot, walk.path[-1]) <= walk.starts_within_m
+            if self._started_s[number] is None and time_s >= walk.start_s and is_near:
                 self._started_s[number] = time_s
 
     def faces(self) -> list[Rectangle]:
@@ -230,7 +227,7 @@ class Walker(Struct, frozen=True):
     speed_mps: Annotated[float, Meta(ge=0.0, le=5.0)] = 1.0
     repeat: Literal["once", "loop", "back and forth"] = "once"
     start_s: Annotated[float, Meta(ge=0.0)] = 0.0
-    starts_within_m: Distance = 0.0
+    starts_within_m: Distance = 0.0  # waits until the robot is this near to its last point; 0: does not wait
     size_m: Size = (0.25, 0.45, 1.7)  # depth, width, height
 
 
@@ -358,6 +355,5 @@ def _box(rng: Random, entry: Box) -> list[Rectangle]:
     return surfaces.solid(at, entry.size_m, yaw_rad, chosen, is_raised=entry.bottom_m > 0)
 
 
-def _person(rng: Random, walker: Walker) -> Person:
-    walk = asdict(walker)
-    return Person(tuple(surfaces.box(rng, (0.0, 0.0), walk.pop("size_m"), 0.0)), **walk)
+def _person(rng: Random, walk: Walker) -> Person:
+    return Person(tuple(surfaces.box(rng, (0.0, 0.0), walk.size_m, 0.0)), walk)

@@ -32,7 +32,7 @@ from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.rendering.surfaces import poster
 from omnid.simulation.robot import START_NS, make_robot
-from omnid.simulation.world import World, cross_track_m, load_world
+from omnid.simulation.world import Walker, World, cross_track_m, load_world
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation.disturbed import Fault, Slip, disturbed, simulate
@@ -257,9 +257,10 @@ def later(seed: int, number: int, rng: random.Random) -> World:
         else face
         for face in building.standing
     )
-    person = replace(load_world("corridor").people[0], repeat="once", starts_within_m=3.0)
+    person = load_world("corridor").people[0]
     walking = tuple(
-        replace(person, path=path, speed_mps=rng.uniform(0.6, 1.0), start_s=rng.uniform(0.0, 10.0)) for path in DOORS
+        replace(person, walk=Walker(path, rng.uniform(0.6, 1.0), start_s=rng.uniform(0.0, 10.0), starts_within_m=3.0))
+        for path in DOORS
     )
     return replace(building, standing=standing, people=walking, brightness=brightness * building.brightness)
 

@@ -24,7 +24,7 @@ from omnid.errors import OmnidError
 from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.simulation.rendering.surfaces import Point, Rectangle
 from omnid.simulation.robot import SimulatedRobot, make_robot
-from omnid.simulation.world import Person
+from omnid.simulation.world import Person, Walker
 from tests.simulation.building_parts import (
     BEHIND_M,
     Builder,
@@ -170,7 +170,7 @@ def _trolley_leaves(b: Builder) -> Trial:
     b.thing(trolley(b), (0.0, 0.0), 0.0, plain_paint(b.rng, b.rng.uniform(60, 170), 3.0))
     cart, b.faces = tuple(b.faces[first:]), b.faces[:first]
     path = ((2.2, 0.0), (high[0] - 1.2, 0.0))
-    return Trial(built(b, people=(Person(cart, path, 0.9, start_s=b.rng.uniform(9.0, 11.0)),)))
+    return Trial(built(b, people=(Person(cart, Walker(path, 0.9, start_s=b.rng.uniform(9.0, 11.0))),)))
 
 
 def _person_passes(b: Builder) -> Trial:
@@ -178,7 +178,7 @@ def _person_passes(b: Builder) -> Trial:
     corridor(b, width_m=3.0)
     side = float(b.rng.choice([-1, 1]))
     path = ((9.0, side * 0.95), (-1.5, side * 0.95))
-    return Trial(built(b, people=(Person(b.adult(), path, b.rng.uniform(0.9, 1.2), start_s=3.0),)))
+    return Trial(built(b, people=(Person(b.adult(), Walker(path, b.rng.uniform(0.9, 1.2), start_s=3.0)),)))
 
 
 # To a goal
@@ -275,7 +275,7 @@ def _doorway_with_person(b: Builder) -> Trial:
     x_m = _two_rooms(b, 0.9, 0.0)
     aside_m = float(b.rng.choice([-1, 1])) * 1.4
     path = ((x_m + 0.1, 0.0), (x_m - 0.5, aside_m * 0.5), (x_m - 0.7, aside_m))
-    walker = Person(b.adult(), path, 0.8, start_s=b.rng.uniform(7.0, 9.0))
+    walker = Person(b.adult(), Walker(path, 0.8, start_s=b.rng.uniform(7.0, 9.0)))
     return Trial(built(b, people=(walker,)), goal=(x_m + 1.8, 0.0, 0.0))
 
 

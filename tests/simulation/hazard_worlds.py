@@ -17,7 +17,7 @@ import numpy as np
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.surfaces import Paint, Point, Rectangle, painted, solid
 from omnid.simulation.robot import SimulatedRobot
-from omnid.simulation.world import Person, moved
+from omnid.simulation.world import Person, Walker, moved
 from tests.simulation import harmless_worlds
 from tests.simulation.building_parts import (
     BEHIND_M,
@@ -273,7 +273,7 @@ def _standing(b: Builder, height_m: float) -> Trial:
     _wide_corridor(b)
     at, towards = _place(b), b.rng.uniform(-1, 1, 2)
     path = (at, (at[0] + towards[0], at[1] + towards[1]))
-    return _people(b, Person(b.adult(height_m), path, 0.0))
+    return _people(b, Person(b.adult(height_m), Walker(path, 0.0)))
 
 
 def _leads(b: Builder, *, comes_back: bool) -> Trial:
@@ -285,7 +285,7 @@ def _leads(b: Builder, *, comes_back: bool) -> Trial:
     if comes_back:
         path, rests_s = (*path, (stop_m - 0.6, y_m)), (*rests_s, 0.0)
     return _people(
-        b, Person(b.adult(), path, b.rng.uniform(0.5, 0.8), start_s=b.rng.uniform(2.0, 4.0), rests_s=rests_s)
+        b, Person(b.adult(), Walker(path, b.rng.uniform(0.5, 0.8), start_s=b.rng.uniform(2.0, 4.0)), rests_s)
     )
 
 
@@ -295,7 +295,7 @@ def _steps_in(b: Builder, within_cm: str) -> Trial:
     x_m, aside_m = b.rng.uniform(2.3, 3.0), float(b.rng.choice([-1, 1])) * 0.95
     starts_m = float(within_cm) / 100 + 0.2 + abs(aside_m) * 0.4
     path = ((x_m, aside_m), (x_m, b.rng.uniform(-0.1, 0.1)))
-    return _people(b, Person(b.adult(), path, b.rng.uniform(0.8, 1.4), starts_within_m=starts_m))
+    return _people(b, Person(b.adult(), Walker(path, b.rng.uniform(0.8, 1.4), starts_within_m=starts_m)))
 
 
 def _crossing(b: Builder, how: str, side: int = 0) -> Person:
@@ -310,7 +310,7 @@ def _crossing(b: Builder, how: str, side: int = 0) -> Person:
         path = (path[0], (x_m, b.rng.uniform(-0.1, 0.1)), path[0])
     if how in ("turns_round", "diagonally"):
         start_s, starts_within_m = 0.75 + (x_m - before_m) / WALKER_MPS, 0.0
-    return Person(b.adult(), path, speed_mps, start_s=start_s, starts_within_m=starts_within_m)
+    return Person(b.adult(), Walker(path, speed_mps, start_s=start_s, starts_within_m=starts_within_m))
 
 
 def _crosses(b: Builder, how: str) -> Trial:
@@ -319,7 +319,7 @@ def _crosses(b: Builder, how: str) -> Trial:
     people = [_crossing(b, how, side) for side in ((1, -1) if how == "two" else (0,))]
     if how == "from_a_door":
         (person,) = people
-        (x_m, y_m), _ = person.path
+        (x_m, y_m), _ = person.walk.path
         wall_m, wide_m = math.copysign(b.rng.uniform(0.9, 1.2), y_m), 0.9
         ends = sorted(((-BEHIND_M, wall_m), (LENGTH_M, wall_m)), reverse=wall_m < 0)
         b.wall(ends[0], ends[1], [Opening(abs(x_m - ends[0][0]) - wide_m / 2, wide_m)])
