@@ -127,9 +127,8 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
         "connect/exit_on_failure": config.is_client,
     }
     if config.is_client:
-        endpoints["connect/timeout_ms"] = round(
-            1000 * CONNECT_S
-        )  # a client that cannot reach its router opens no session
+        # A client that cannot reach its router opens no session.
+        endpoints["connect/timeout_ms"] = round(1000 * CONNECT_S)
     try:
         for key, value in endpoints.items():
             result.insert_json5(key, json.dumps(value))

@@ -13,6 +13,7 @@ import re
 import time
 import zlib
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from http import HTTPStatus
 from typing import Any, Final
@@ -46,7 +47,7 @@ class RobotFeed:
     def __init__(self, bus: BusConfig) -> None:
         """bus: settings of the connection, which has been checked."""
         self.bus = bus
-        self.state = RobotState(_NEWEST_ONLY)
+        self.state, self._inbox_thread = RobotState(_NEWEST_ONLY), ThreadPoolExecutor(1)
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
         # Of the news: it grows by one each time, and more slowly than this first one, which is Unix time in ms: pages
@@ -95,7 +96,8 @@ class RobotFeed:
         while True:
             await asyncio.sleep(PERIOD_S)
             if self.state.is_waiting or time.monotonic() > given_s + QUIET_S:
-                await asyncio.to_thread(self.process_inbox)  # maps and images take time
+                # Maps and images take time; the other threads may all wait for answers of the robot.
+                await asyncio.get_running_loop().run_in_executor(self._inbox_thread, self.process_inbox)
                 self.version, given_s = self.version + 1, time.monotonic()
 
     async def _connect(self) -> None:
