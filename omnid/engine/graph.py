@@ -331,16 +331,14 @@ class Graph:
                 del self.stats[node.name]
                 continue
             # From the last stage to the first: its readers are known, and are served in the order of the wiring.
+            thread = node.stream.thread
             for stream in node.inputs:
-                stream.readers.insert(0, self._reader(node, stream))
-
-    def _reader(self, node: _Node, stream: Stream[Any]) -> Callable[[object], None]:
-        thread = node.stream.thread
-        if not self.threaded or stream.thread == thread:
-            return node.put
-        inbox = self._inboxes.setdefault(thread, _Inbox(self))
-        drops = self.drops or bool(stream.depth)
-        return inbox.reader(node, stream.depth or node.depth or self._depth, drops=drops)
+                put: Callable[[object], None] = node.put
+                if self.threaded and stream.thread != thread:
+                    inbox = self._inboxes.setdefault(thread, _Inbox(self))
+                    depth = stream.depth or node.depth or self._depth
+                    put = inbox.reader(node, depth, drops=self.drops or bool(stream.depth))
+                stream.readers.insert(0, put)
 
     # The run.
 
