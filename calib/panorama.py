@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,6 +140,17 @@ def fit_cylinder(
     if width * height > MAX_PIXELS:
         raise _too_large(f"{width} x {height} pixels")
     return Cylinder(width, height, row0, turn, first, scale)
+
+
+def at_pixels(table: NDArray[Any], pixels: Array) -> NDArray[Any]:
+    """Return the values (...) of a panorama's table (H, W) at the nearest of pixels (..., 2): columns wrap around.
+
+    Rows beyond the table are its first and last one; NaN is pixel 0.
+    """
+    height, width = table.shape
+    nearest = np.rint(np.nan_to_num(pixels))
+    rows = np.clip(nearest[..., 1], 0, height - 1).astype(np.intp)
+    return np.asarray(table[rows, nearest[..., 0].astype(np.intp) % width])
 
 
 def at_scale(px: float, scale: float) -> int:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.panorama import at_scale
+from calib.panorama import at_pixels, at_scale
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -70,10 +70,7 @@ def nearby_disparity(disparity: NDArray[np.float32], points: Array) -> Array:
 
     A feature counts as located if a located point lies close to it: Dang et al. 2012, eq. (8).
     """
-    height, width = disparity.shape
-    offsets = np.arange(-REACH_PX, REACH_PX + 1)
-    columns = (np.rint(points[:, 0]).astype(int)[:, None, None] + offsets[None, None, :]) % width
-    rows = np.clip(np.rint(points[:, 1]).astype(int)[:, None, None] + offsets[None, :, None], 0, height - 1)
-    around = np.sort(disparity[rows, columns].reshape(len(points), len(offsets) ** 2), axis=1)  # NaN last
+    offsets = np.stack(np.meshgrid(*2 * [np.arange(-REACH_PX, REACH_PX + 1)]), axis=-1).reshape(-1, 2)
+    around = np.sort(at_pixels(disparity, np.rint(points)[:, None] + offsets), axis=1)  # NaN last
     count = np.isfinite(around).sum(axis=1)
     return np.asarray(around[np.arange(len(points)), np.maximum(count - 1, 0) // 2], float)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.panorama import Cylinder
+from calib.panorama import Cylinder, at_pixels
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.tracking import normalised_patches
 from omnid.core.types.panorama import PaddedPanorama
@@ -55,11 +55,9 @@ def contradicted(
     seen = cylinder.pixels(there)
     if earlier.exposure is not None:
         seen -= earlier.exposure.shift(there).lower
-    height, width = earlier.usable.shape
-    columns, rows = np.nan_to_num(np.rint(seen)).astype(np.intp).T
-    chosen = earlier.usable[np.clip(rows, 0, height - 1), columns % width] & cylinder.shows(seen[:, 0])
+    chosen, middle = at_pixels(earlier.usable, seen) & cylinder.shows(seen[:, 0]), (cylinder.height - 1) / 2
     for at in (pixels, seen):
-        chosen &= np.abs(at[:, 1] - (height - 1) / 2) <= (height - 1) / 2 - HALF_PX
+        chosen &= np.abs(at[:, 1] - middle) <= middle - HALF_PX
     # 2. The correlations of both hypotheses there; they are one where the point has not moved in the image.
     here, there = pixels[chosen], seen[chosen]
     now, _ = normalised_patches(lower, here, 2 * HALF_PX + 1)

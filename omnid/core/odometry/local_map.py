@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.panorama import MIN_RADIUS
+from calib.panorama import MIN_RADIUS, at_pixels
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import RigVelocity
 from omnid.core.odometry.plane_patches import (
@@ -265,10 +265,7 @@ class LocalMap:
         is_inside = (predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom)
         is_inside &= self._model.cylinder.shows(predicted[:, 0])
         if self.lost is not None:
-            height, width = self.lost.shape
-            columns = np.rint(np.nan_to_num(predicted[:, 0])).astype(np.intp) % width
-            pixel_rows = np.clip(np.rint(np.nan_to_num(predicted[:, 1])), 0, height - 1).astype(np.intp)
-            is_inside &= ~self.lost[pixel_rows, columns]
+            is_inside &= ~at_pixels(self.lost, predicted[:, :2])
         rows = np.flatnonzero(is_inside)
         return rows, predicted[rows]
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.panorama import at_pixels
 from omnid.core.odometry import patch_kernels
 from omnid.core.odometry.tracking import padded
 from omnid.core.stereo.triangulation import triangulate
@@ -116,12 +117,9 @@ def disparity_slopes(disparity: Floats, points: Array, centre: Array) -> Array:
     A plane through the centre by regularised least squares; neighbours that differ by more than SAME_SURFACE_PX are
     left out, and all where the centre is NaN. Dense stereo matches upright windows, so these slopes are too flat.
     """
-    height, width = disparity.shape
     offsets = np.arange(-SLOPE_REACH_PX, SLOPE_REACH_PX + 1)
     dx, dy = (grid.ravel() for grid in np.meshgrid(offsets, offsets))
-    columns = (np.rint(points[:, :1]).astype(int) + dx) % width
-    rows = np.clip(np.rint(points[:, 1:]).astype(int) + dy, 0, height - 1)
-    change = disparity[rows, columns] - centre[:, None]
+    change = at_pixels(disparity, np.rint(points)[:, None] + np.column_stack([dx, dy])) - centre[:, None]
     near = np.abs(change) < SAME_SURFACE_PX
     change = np.where(near, change, 0.0)
     xx, yy, xy = near @ (dx * dx) + SLOPE_PRIOR, near @ (dy * dy) + SLOPE_PRIOR, near @ (dx * dy)

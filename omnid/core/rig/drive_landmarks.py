@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.fit.rig_from_drive import DriveObservations
-from calib.panorama import Cylinder
+from calib.panorama import Cylinder, at_pixels
 from calib.rig import Rig
 from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
 from omnid.core.odometry.local_map import Keyframe, LocalMap, NewLandmarks
@@ -80,7 +80,7 @@ class DriveLandmarks:
         #    does not grow from keyframe to keyframe.
         tracks = self._map.track(current.lower, T_odom_rect)
         pixels, fits = self._aligned(current, T_odom_rect, tracks.landmarks, tracks.pixels, upper=False)
-        fits &= _is_set(current.visible, pixels)
+        fits &= at_pixels(current.visible, pixels)
         rows, pixels, predicted = tracks.landmarks[fits], pixels[fits], tracks.predicted[fits]
         self._observe(rows, 0, pixels)
         # 2. The same in the upper panorama.
@@ -131,12 +131,6 @@ class DriveLandmarks:
         aligned = self._map.align(image, T_odom_rect, rows, near, 2 * REACH_PX, upper=upper)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
         return np.column_stack([current.lower.own(pixels[:, 0]), pixels[:, 1]]), aligned.found
-
-
-def _is_set(flags: Flags, pixels: Array) -> Flags:
-    """Return flags (H, W) at the nearest of pixels (N, 2)."""
-    column, row = np.rint(pixels).astype(int).T
-    return np.asarray(flags[np.clip(row, 0, flags.shape[0] - 1), column % flags.shape[1]])
 
 
 def in_images(seen: DriveObservations, points: Array, rig: Rig, cylinder: Cylinder) -> tuple[DriveObservations, Array]:

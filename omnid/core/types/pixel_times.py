@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.panorama import at_pixels
+
 Array = NDArray[np.float64]
 
 
@@ -43,8 +45,4 @@ SYNCHRONISED: Final = PixelTimes()
 
 def _read(table: NDArray[np.float32], pixels: Array) -> Array:
     """Return the values (N,) of a table (H, W) at the nearest of pixels (N, 2); zeros from an empty table."""
-    if table.size == 0:
-        return np.zeros(len(pixels))
-    columns = np.rint(pixels[:, 0]).astype(np.intp) % table.shape[1]
-    rows = np.clip(np.rint(pixels[:, 1]), 0, len(table) - 1).astype(np.intp)
-    return np.asarray(table[rows, columns], float)
+    return np.asarray(at_pixels(table, pixels), float) if table.size else np.zeros(len(pixels))
