@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.panorama import at_scale
 from omnid.core.stereo.semiglobal import ColumnShift
-from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import motion_jacobian, triangulate, view
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.core.types.stereo_model import StereoModel
 
@@ -87,8 +86,7 @@ class Exposure:
         in_lower, in_upper = (view(self._later(points, s), cylinder, baseline_m) for s in (lower_s, upper_s))
         lower, upper = seen[:, :2] - in_lower[:, :2], seen[:, [0, 2]] - in_upper[:, [0, 2]]
         lower[:, 0], upper[:, 0] = cylinder.wrap(lower[:, 0]), cylinder.wrap(upper[:, 0])
-        of_point = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(points)], axis=2)
-        J = (view_jacobian(points, cylinder, baseline_m) @ of_point)[:, [0, 1, 2, 0]]
+        J = motion_jacobian(points, cylinder, baseline_m)[:, [0, 1, 2, 0]]
         times_s = np.column_stack([lower_s, lower_s, upper_s, upper_s])
         return ViewShift(lower, upper, times_s[:, :, None] * J)
 

@@ -36,7 +36,7 @@ from omnid.core.odometry.plane_patches import WINDOW_PX, align, plane_templates
 from omnid.core.odometry.pose_estimation import CORRELATED, DAMPING, GAUSS_NEWTON_STEPS, OUTLIER_SQUARED, cost
 from omnid.core.odometry.pose_kernels import VIEW
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.stereo.triangulation import view, view_jacobian
+from omnid.core.stereo.triangulation import motion_jacobian, view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
@@ -217,7 +217,7 @@ def _flow(
     shifts = [each.exposure.shift(at) for each, at in zip(views, seen, strict=True)]
     pixels = [view(at, cylinder, baseline_m) for at in seen]
     J_before, J_now = (view_jacobian(at, cylinder, baseline_m) for at in seen)
-    of_step = np.concatenate([np.broadcast_to(-np.eye(3), (len(points), 3, 3)), se3.hat(seen[1])], axis=2)
+    of_step = -motion_jacobian(seen[1], cylinder, baseline_m)
     of_point = J_now @ now.T_odom_rect[:3, :3].T - J_before @ last.T_odom_rect[:3, :3].T
     parts, sought = [], 0
     for camera, raw_image in enumerate(raws):
@@ -253,7 +253,7 @@ def _flow(
         noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], covariance[rows], of_point[rows][:, own])
         noise += shifts[1].variance(now.exposure.motion)[rows][:, [0, 1] if camera == 0 else [3, 2]]
         px = np.sqrt(SIGMA_PX**2 + noise.mean(axis=1))
-        J, shift = J_now[rows][:, own] @ of_step[rows] / px[:, None, None], by_raw[rows] / px[:, None, None]
+        J, shift = of_step[rows][:, own] / px[:, None, None], by_raw[rows] / px[:, None, None]
         size = np.array(raw_image.size)
         arm = raw[rows] - (size - 1) / 2
         turn = shift @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]

@@ -27,7 +27,7 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.pose_estimation import CORRELATED, KERNEL_WIDTH
 from omnid.core.odometry.pose_kernels import VIEW
-from omnid.core.stereo.triangulation import view, view_jacobian
+from omnid.core.stereo.triangulation import motion_jacobian, view, view_jacobian
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ class LineTimes:
         by_now, moved = self._shifts(points, J, velocity)
         by_anchor, _ = self._shifts(at_anchor, J_anchor, velocities)
         by_times = by_now - J @ R @ np.linalg.solve(J_anchor, by_anchor)
-        of_pose = J @ np.concatenate([np.broadcast_to(-np.eye(3), J.shape), se3.hat(points)], axis=2)
+        of_pose = -motion_jacobian(points, cylinder, baseline_m)
         # 3. Whitened, with the weights of the pose's kernel.
         S = self._model.sigma_px**2 * np.eye(3) + J @ R @ table.anchor_covariance[rows] @ np.swapaxes(J @ R, 1, 2)
         S[:, 2, 2] += seen.variance[chosen]

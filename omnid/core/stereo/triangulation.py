@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from calib.panorama import MIN_RADIUS, Cylinder
 
 Array = NDArray[np.float64]
@@ -41,6 +42,12 @@ def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array
     for row, height in ((1, z), (2, z - baseline_m)):
         J[:, row, 0], J[:, row, 1], J[:, row, 2] = f * height * x / (r2 * r), f * height * y / (r2 * r), -f / r
     return J
+
+
+def motion_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
+    """Return the derivatives (N, 3, 6) of the view by a small motion [t; r] of the point: p + t + r x p."""
+    of_point = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(points)], axis=2)
+    return np.asarray(view_jacobian(points, cylinder, baseline_m) @ of_point)
 
 
 def point_covariance(
