@@ -33,8 +33,7 @@ from omnid.core.odometry.line_times import CAMERAS, LAG_S, LEAST_PX, MEMORY_S, S
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 from omnid.core.odometry.plane_patches import WINDOW_PX, align, plane_templates
-from omnid.core.odometry.pose_estimation import CORRELATED, DAMPING, GAUSS_NEWTON_STEPS, OUTLIER_SQUARED, cost
-from omnid.core.odometry.pose_kernels import VIEW
+from omnid.core.odometry.pose_estimation import CORRELATED, DAMPING, GAUSS_NEWTON_STEPS, OUTLIER_SQUARED, VIEW, cost
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import motion_jacobian, view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama

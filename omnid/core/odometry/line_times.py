@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.pose_estimation import CORRELATED, KERNEL_WIDTH
-from omnid.core.odometry.pose_kernels import VIEW
+from omnid.core.odometry.pose_estimation import CORRELATED, KERNEL_WIDTH, VIEW
 from omnid.core.stereo.triangulation import motion_jacobian, view, view_jacobian
 from omnid.core.types.stereo_model import StereoModel
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_kernels import POSE, normal_equations
-from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import motion_jacobian, triangulate, view, view_jacobian
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+VIEW, POSE = 3, 6  # numbers of a view and of a step
 # Largest error of a view in the consensus set. Measured: with 1.34 and 3 px the odometry's error is 0.96 and 1.01 times
 # as large.
 RANSAC_THRESHOLD_PX = 2.0
@@ -138,12 +138,20 @@ def gauss_newton(
     S[is_lower_only, 2, 2] = 1.0
     information = np.asarray(np.linalg.inv(S), float)
     information[is_lower_only, 2, 2] = 0.0
+    views = np.where(np.isnan(views), 0.0, views)
     # 2. Steps. If one is short, the last equations hold after it as well.
-    error, squared, inverse = np.zeros(size - POSE), np.empty(len(views)), np.empty((size, size))
-    landmarks, views, by_error, T = map(np.ascontiguousarray, (landmarks, views, by_error, T))
+    error = np.zeros(size - POSE)
     for number in range(steps + 1):
-        H, g = prior.copy(), -prior[:, POSE:] @ error
-        normal_equations(landmarks, views, information, by_error, model.camera, KERNEL_WIDTH, T, error, squared, H, g)
+        # The errors e = v - view(T p) + D s, and their derivatives -J by [t; r] on the left of T and by s.
+        points = se3.apply(T, landmarks)
+        e = views - view(points, model.cylinder, model.baseline_m) + by_error @ error
+        e[:, 0] = model.cylinder.wrap(e[:, 0])
+        J = np.concatenate([motion_jacobian(points, model.cylinder, model.baseline_m), -by_error], axis=2)
+        informed = np.einsum("nij,nj->ni", information, e)
+        squared = (e * informed).sum(axis=1)
+        weighted = J / (1 + squared / KERNEL_WIDTH**2)[:, None, None]
+        H = prior + np.tensordot(weighted, information @ J, axes=((0, 1), (0, 1)))
+        g = np.tensordot(weighted, informed, axes=((0, 1), (0, 1))) - prior[:, POSE:] @ error
         inverse = np.linalg.inv(H)
         if number == steps:
             break

@@ -14,12 +14,3 @@ class StereoModel:
     cylinder: Cylinder
     baseline_m: float
     sigma_px: float = 0.1  # standard deviation
-
-    @property
-    def camera(self) -> tuple[float, float, float, float, float]:
-        """Focal length [px], row0, columns of a turn [px], baseline [m] and azimuth of the left edge [rad].
-
-        They are the arguments of compiled functions.
-        """
-        cylinder = self.cylinder
-        return cylinder.focal_px, cylinder.row0, float(cylinder.turn_px), self.baseline_m, cylinder.left_rad
