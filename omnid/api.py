@@ -51,8 +51,8 @@ def replay(
     log: an MCAP file, or the folder of `ros2 bag record -s mcap`. rig: a rig.toml or a Rig; None: the one attached to
     the log. config: a TOML file or a Config; None: the defaults. overrides: settings such as "stereo.min_range_m=0.5"
     over those of the file. method: odometry.method. lower, upper: topics of the images; None: those of the rig, else
-    by their names. A motor.port of the configuration is driven as by `omnid replay`. progress: called several times
-    a second, in a thread of the run, with the number of pairs so far and the expected number, None if unknown.
+    by their names. progress: called several times a second, in a thread of the run, with the number of pairs so far
+    and the expected number, None if unknown.
 
     All poses and the map stay in memory (about 75 MB an hour at 30 Hz). Ctrl-C ends the run and
     raises KeyboardInterrupt. Raises OmnidError for input that cannot be used.

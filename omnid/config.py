@@ -279,17 +279,16 @@ def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str
 
 # Keys and sections that only one of `omnid run` and `omnid replay` uses.
 _RUN_ONLY: Final = (
-    *("bus.panorama_hz.", "cameras.", "controller.arming.", "live.", "navigation.", "places.save_s.", "realtime."),
+    *("bus.panorama_hz.", "cameras.", "controller.", "live.", "motor.", "navigation.", "places.save_s.", "realtime."),
     *("record.", "service."),
 )
-_REPLAY_ONLY: Final = ("controller.setpoint.", "log.")
+_REPLAY_ONLY: Final = ("log.",)
 
 
 def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> list[str]:
     """Return the warning, if there is one, that a command ignores settings of the configuration file.
 
-    command: run or replay. Raises OmnidError for an override that the command ignores, and for a setpoint in `run`:
-    a robot must not be expected to drive by itself.
+    command: run or replay. Raises OmnidError for an override that the command ignores.
     """
     others = _REPLAY_ONLY if command == "run" else _RUN_ONLY
     for override in overrides:
@@ -297,11 +296,6 @@ def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> l
         if f"{path}.".startswith(others):
             raise OmnidError(f"override {override!r}: `omnid {command}` does not use {path}: leave it out")
     ignored = [path for path in changed(config) if f"{path}.".startswith(others)]
-    if setpoint := [path for path in ignored if path.startswith("controller.setpoint.")]:
-        raise OmnidError(
-            f"{setpoint[0]} is set, but `omnid run` drives by the setpoints that it receives, as cmd/twist or "
-            "cmd/heading: remove it from the configuration"
-        )
     return [f"`omnid {command}` does not use these settings: {', '.join(ignored)}"] if ignored else []
 
 

@@ -140,8 +140,6 @@ def replay(args: argparse.Namespace) -> int:
     --rerun FILE.rrd      path, images with features, depth and plots for the viewer Rerun; not beside --record
     --publish             publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon
         publishes there
-    --motor PORT [motor.port]  send commands to the motor controller on a serial port (the wheels will turn!), or to a
-        'simulated' one
 
     computation:
     --method default|paper [odometry.method]   paper: the odometry of the paper on its enhanced SAD, for comparison

@@ -37,7 +37,6 @@ class ControllerStart(NamedTuple):
     motor: MotorSettings
     controller: ControllerSettings
     realtime: RealtimeSettings
-    waits: bool = False  # the start fails without a motor controller that answers; otherwise it is asked on
 
 
 class ControllerUpdate(NamedTuple):
@@ -53,7 +52,7 @@ class ControllerUpdate(NamedTuple):
 
 
 class StartFailed(NamedTuple):
-    """The process ends because the motor controller's settings cannot be used, or because it has not answered."""
+    """The process ends because the motor controller's settings cannot be used."""
 
     reason: str
 

@@ -143,18 +143,14 @@ class ControllerLink:
         since_ns = time.monotonic_ns()  # the process has ticked, with the wheels stopped, since before the stages began
         with suppress(EOFError):
             while not self._ended_ns or (time.monotonic_ns() - self._ended_ns) * S_PER_NS <= END_S:
-                message = self._receive(POLL_S)
-                if isinstance(message, TickReport) and message.command and message.command.stamp_ns >= since_ns:
-                    yield message.command
+                message: object = self._channel.receive(POLL_S)
+                if isinstance(message, LogRecord):
+                    self._report(message.text)
+                elif isinstance(message, TickReport):
+                    self.statistics.add(message)
+                    if message.command and message.command.stamp_ns >= since_ns:
+                        yield message.command
         self._require_asked_end()
-
-    def receive_waiting(self) -> None:
-        """Process the reports that have arrived, without waiting; OmnidError where the process has ended unasked."""
-        try:
-            while self._receive(0.0) is not NO_MESSAGE:
-                pass
-        except EOFError:
-            self._require_asked_end()
 
     def close(self) -> None:
         """Return when the process has ended; a second call does nothing."""
@@ -165,15 +161,6 @@ class ControllerLink:
             self._process.kill()
             self._process.wait()
         self._channel.close()
-
-    def _receive(self, timeout_s: float) -> object:
-        """Return the next report, which is counted or logged, or NO_MESSAGE; EOFError once the process has ended."""
-        message: object = self._channel.receive(timeout_s)
-        if isinstance(message, TickReport):
-            self.statistics.add(message)
-        elif isinstance(message, LogRecord):
-            self._report(message.text)
-        return message
 
     def _await_start(self, start_s: float) -> None:
         try:

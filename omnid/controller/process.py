@@ -39,7 +39,7 @@ def run_controller(channel: Channel) -> int:
         closing.callback(channel.close)  # last of all, when the wheels are at rest
         start: ControllerStart = channel.receive(LONGEST_RAMP_S)
         try:
-            driver = open_motor(start.motor, closing, waits=start.waits)
+            driver = open_motor(start.motor, closing, waits=False)
         except DriverError as error:
             channel.send(StartFailed(str(error)))
             return 2
@@ -54,7 +54,7 @@ def run_controller(channel: Channel) -> int:
             1.0 / start.motor.rate_hz,
             lambda text: channel.send(LogRecord(text)),
             limited=start.motor.drive.limited,
-            is_awaited=not start.waits,
+            is_awaited=True,
         )
         run_until_end(channel, controller)
     return 0

@@ -76,7 +76,6 @@ class RunCounters:
     resets: int  # gaps in the trajectory after which tracking began again
     drops: Mapping[str, int]  # messages lost, by reason; zeros too
     places: Mapping[str, int] = field(default_factory=dict)  # keyframes, loops, refusals; empty without a map of places
-    motor: Mapping[str, int] = field(default_factory=dict)  # commands, errors, stops; empty without a motor
     loss: str = ""  # one line where more than a tenth of the pairs is missing
 
     @property
@@ -106,14 +105,13 @@ def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str
     def listed(counts: Mapping[str, int], zeros: bool = True) -> str:
         return ", ".join(f"{name} {count}" for name, count in counts.items() if count or zeros)
 
-    poses, resets, motor = counters.poses, counters.resets, counters.motor
+    poses, resets = counters.poses, counters.resets
     found = {
         "pairs": str(counters.pairs),
         "poses": str(poses),
         "lost": listed(counters.drops, verbose),
         "resets": str(resets) if resets or verbose else "",
         "places": listed(counters.places) if verbose else "",
-        "motor": "{commands} commands sent, {errors} errors, {stops} stops".format_map(motor) if motor else "",
         "length": f"{counters.length_m:.4f} m",
         "states": ", ".join(f"{s} {n / (poses or 1):.1%}" for s, n in counters.states.items() if n or verbose),
     }

@@ -24,8 +24,8 @@ from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.logs.mcap_writer import RotatingLog
 from omnid.config import Config
-from omnid.controller.ipc import ARMED
-from omnid.controller.link import DriveLink
+from omnid.controller.ipc import ARMED, ControllerStart
+from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.control.arming import MANUAL
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.rig.rig_health import RigHealth
@@ -93,7 +93,20 @@ class ConnectedRobot:
         cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
         self.states = {name: camera.state for name, camera in cameras.items()}
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
-        return frames, session.start_controller() if session.config.motor.port else None
+        return frames, _start_controller(session) if session.config.motor.port else None
+
+
+def _start_controller(session: Session) -> ControllerLink:
+    """Start the controller process, which waits for the motor controller; DriverError for settings it cannot use.
+
+    The wheels stop, and the process ends, at the latest with the outputs of the session.
+    """
+    config = session.config
+    settings = config.controller if config.obstacles.enabled else config.controller.without_obstacles
+    start = ControllerStart(config.motor, settings, config.realtime)
+    link = ControllerLink(start, session.graph.counters("motor"), session.warn)
+    session.outputs.callback(link.close)
+    return link
 
 
 def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> None:

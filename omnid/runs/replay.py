@@ -36,7 +36,6 @@ from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import BACKGROUND, Inputs, Session, attached_rig, run_to_end, wire
 from omnid.settings import dump
-from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import BusSink, Outgoing
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
@@ -186,7 +185,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         updates, newest_map = list[PlaceUpdate](), deque[MapUpdate](maxlen=1)
         rig = geometry.rig
         recorder: Recorder | None = None
-        wheels: ReplayDrive | None = None
         graph.sink("statistics", session.statistics, poses, thread=poses.thread)
         if options.collect:
             graph.sink("collect-poses", lambda pose: collected.append(kept(pose)), poses, thread=BACKGROUND)
@@ -202,10 +200,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             graph.sink(
                 "plan", lambda now: write_plan(plan, now.points, now.path_xy, heights_m), maps, thread=BACKGROUND
             )
-        if config.motor.port:
-            controller = session.start_controller(of_replay=True)
-            wheels = ReplayDrive(controller, config.controller.setpoint.setpoint(), rig.T_base_rig, front_end.health)
-            graph.sink("controller", wheels, poses, thread=poses.thread)
         if options.publish:
             bus = session.open_bus(rig, gives_time=True)
             streams.publish(graph, BusSink(bus, session.encoder(rig), gives_time=True))
@@ -238,7 +232,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             found.newest.reset_counter if found.newest else 0,
             drops,
             {} if places is None else places.counts,
-            {} if wheels is None else wheels.counts(),
             pair_loss(front_end.pairing, read),
         )
         if recorder is not None:

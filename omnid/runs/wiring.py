@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -18,8 +18,8 @@ from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.ipc import ControllerStart, ControllerState
-from omnid.controller.link import ControllerLink, DriveLink
+from omnid.controller.ipc import ControllerState
+from omnid.controller.link import DriveLink
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.diagnostics.status import RunStatistics
@@ -128,22 +128,6 @@ class Session:
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         return bus
-
-    def start_controller(self, *, of_replay: bool = False) -> ControllerLink:
-        """Start the controller process; DriverError where its settings cannot be used.
-
-        A live run waits for its motor controller as for its cameras, while a replay needs it at once: DriverError. The
-        process of a replay has no privileges. The wheels stop, and the process ends, at the latest with `outputs`.
-        """
-        settings, realtime = self.config.controller, self.config.realtime
-        if of_replay:
-            settings, realtime = settings.of_replay, replace(realtime, motor_priority=0)
-        elif not self.config.obstacles.enabled:
-            settings = settings.without_obstacles
-        start = ControllerStart(self.config.motor, settings, realtime, waits=of_replay)
-        link = ControllerLink(start, self.graph.counters("motor"), self.warn)
-        self.outputs.callback(link.close)
-        return link
 
     def encoder(self, rig: Rig) -> Encoder:
         """Return an encoder of the messages that leave the run."""

@@ -1,4 +1,4 @@
-"""Sinks that send poses and setpoints to the controller, on the robot and in a replay."""
+"""Sinks that send poses, obstacles and setpoints to the controller, and the answers to requests."""
 
 from __future__ import annotations
 
@@ -10,15 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from drivers.errors import DriverError
 from omnid.controller.ipc import ControllerState
-from omnid.controller.link import ControllerLink, DriveLink
+from omnid.controller.link import DriveLink
 from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
-from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.frames import of_base
-from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate
 from omnid.navigation_state import with_reason
 from omnid.stages.obstacles import controller_scan
@@ -26,9 +23,6 @@ from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer, Answers
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender, which keeps other programs off its source
-NO_MOTOR: Final = (
-    "the motor controller does not answer any more; its own watchdog stops the wheels: check its power and its cable"
-)
 
 
 class LiveDrive:
@@ -73,43 +67,6 @@ def navigation_answers(update: NavigationUpdate) -> Answers | None:
     refusal = update.answer.refusal
     text = refusal or f"accepted; navigation: {with_reason(update.state, update.reason)}"
     return {update.answer.id: Answer(not refusal, text)}
-
-
-class ReplayDrive:
-    """Drive the base with the poses of a replay and the setpoint of the configuration.
-
-    The controller runs in real time at any speed of the replay: a pose counts as captured when it arrives here,
-    and renews the setpoint. A replay that gives no pose for the deadlines' time stops the wheels, as a robot does.
-    """
-
-    def __init__(
-        self, link: ControllerLink, setpoint: Setpoint, T_base_rig: NDArray[np.float64], health: RigHealth
-    ) -> None:
-        """health: of the rig; the wheels stay stopped until the first pairs have shown whether it is right."""
-        self._link, self._setpoint, self._T_base_rig = link, setpoint, T_base_rig
-        self._health, self._has_begun = health, False
-
-    def process(self, odometry: OdometryUpdate) -> None:
-        """Send a pose and the setpoint as of now; DriverError where the motor controller has failed."""
-        self._has_begun |= not self._health.is_checking
-        if self._has_begun:
-            now_ns = time.monotonic_ns()
-            self._link.send(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
-            self._link.send(TimedSetpoint(now_ns, self._setpoint))
-            self._link.receive_waiting()
-            if self._link.statistics.state.failed:
-                raise DriverError(NO_MOTOR)
-
-    def finish(self) -> None:
-        """Have the wheels slow down to a stop, and receive the last reports."""
-        self._link.end()
-        for _ in self._link.commands():
-            pass
-
-    def counts(self) -> dict[str, int]:
-        """Return the commands that were answered, the errors, and how often moving wheels had to stop."""
-        state = self._link.statistics.state
-        return {"commands": state.sent, "errors": state.errors, "stops": state.stops.total()}
 
 
 def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -> ControllerPose:

@@ -167,7 +167,7 @@ def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
 @pytest.mark.parametrize(
     ("command", "override"),
     [
-        ("run", " controller.setpoint . velocity_mps=0.0"),
+        ("run", " log . time=header"),
         ("replay", "cameras.width_px=640"),
     ],
 )
@@ -177,8 +177,8 @@ def test_an_override_that_the_command_ignores_is_refused(command: str, override:
         unused_settings(config, command, [override])
 
 
-def test_the_daemon_refuses_a_setpoint_in_its_configuration() -> None:
-    config = load_config(None, ["controller.setpoint.velocity_mps=0.3"])
-    with pytest.raises(OmnidError, match="velocity_mps is set, but `omnid run` drives by the setpoints"):
-        unused_settings(config, "run", [])
-    assert unused_settings(config, "replay", ["controller.setpoint.velocity_mps=0.3"]) == []
+def test_a_replay_names_the_settings_of_the_wheels_which_it_does_not_turn() -> None:
+    config = load_config(None, ["motor.port=/dev/ttyUSB0", "controller.arming=automatic"])
+    assert unused_settings(config, "replay", []) == [
+        "`omnid replay` does not use these settings: controller.arming, motor.port"
+    ]

@@ -1,4 +1,4 @@
-"""Replays as processes: stopped by signals, poses over the bus, driving a motor on a pty."""
+"""Replays as processes: stopped by signals, poses over the bus, a full disk."""
 
 from __future__ import annotations
 
@@ -16,12 +16,10 @@ import pytest
 import zenoh
 from mcap.reader import make_reader
 
-from drivers.motor import is_stop
 from tests.conftest import PAIRS
-from tests.contract.simulated_controllers import PtyMotor
 from tests.ply import read_ply
 from tests.ports import free_port
-from tests.replay.command import Command, rows
+from tests.replay.command import rows
 from tests.replay.edited import images, save
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -115,33 +113,6 @@ def test_the_ten_lines_of_the_document_hear_a_robot_without_omnid(scene: Path) -
             assert hears.stdout is not None
             assert "Point(x=" in hears.stdout.readline()
             assert process.wait(PATIENCE_S) == 0
-
-
-def test_motor_gets_the_commands_and_stops_at_the_end(omnid: Command, scene: Path) -> None:
-    motor = PtyMotor()
-    try:
-        setpoint = ("controller.setpoint.velocity_mps=0.4", "controller.setpoint.heading_deg=10")
-        sets = (word for setting in setpoint for word in ("--set", setting))
-        result = omnid.replay(scene / "log.mcap", "--realtime", "--motor", motor.port, *sets, rig=scene / "rig.toml")
-        assert result.code == 0, result.err
-        assert motor.base.commands > 20 and motor.base.errors == 0
-        assert motor.base.pose[0] > 0.1, "the wheels have turned"
-        assert motor.base.last_command is not None and is_stop(motor.base.last_command)
-        wait_until(lambda: motor.base.velocity_mps == 0)
-    finally:
-        motor.close()
-
-
-def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
-    motor = PtyMotor()
-    tum = tmp_path / "est.txt"
-    with started(replaying(scene, "--realtime", "--quiet", "--tum", tum, "--motor", motor.port)) as process:
-        wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
-        motor.close()
-        _, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 2, err
-    assert err.splitlines()[-1].startswith("omnid: the motor controller does not answer any more"), err
-    assert len(rows(tum)) >= 3
 
 
 def test_a_full_disk_leaves_whole_rows(tmp_path: Path, scene: Path) -> None:

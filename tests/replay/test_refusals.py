@@ -40,7 +40,7 @@ TABLE = (
     ("replay {log} --set odometry.method=magic", "'paper'"),
     ("replay {log} --seconds 0", "--seconds: expected 0.001 or more, found '0'"),
     ("replay {log} --rig {rig} --map {log}", "expected a map of places"),
-    ("replay {log} --rig {rig} --motor {folder}/tty", "motor port"),
+    ("replay {log} --rig {rig} --set motor.port={folder}/tty", "does not use motor.port"),
     ("eval {rig}", "the following arguments are required"),
     ("run --once", "add --log"),
     ("run --log {log}", "no rig.toml is attached"),

@@ -9,10 +9,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
-from msgspec import Meta
-
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest, CommandSelector, Contacts, TimedSetpoint
+from omnid.core.control.arming import MANUAL, Arming, ArmRequest, CommandSelector, Contacts, TimedSetpoint
 from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan
 from omnid.core.control.heading_controller import (
     JUMP_RAD,
@@ -34,24 +32,11 @@ TO_STAND: Final = Setpoint()
 
 
 @dataclass(frozen=True, slots=True)
-class ReplaySetpoint:
-    """The setpoint of a replay, which has no operator; it is renewed all the time."""
-
-    velocity_mps: Annotated[float, Meta(ge=-10, le=10), "replay: forward speed, m/s"] = 0.0
-    heading_deg: Annotated[float, Meta(ge=-360, le=360), "replay: heading in odom, counter-clockwise, deg"] = 0.0
-
-    def setpoint(self) -> Setpoint:
-        """Return it in SI units."""
-        return Setpoint(self.velocity_mps, math.radians(self.heading_deg))
-
-
-@dataclass(frozen=True, slots=True)
 class ControllerSettings:
-    """Deadlines and limits of the base, the same in `omnid run` and in replays."""
+    """Deadlines and limits of the base."""
 
     deadlines: Deadlines = field(default_factory=Deadlines)
     limits: VelocityLimits = field(default_factory=VelocityLimits)
-    setpoint: ReplaySetpoint = field(default_factory=ReplaySetpoint)
     arming: Annotated[
         Literal["manual", "automatic"],
         "manual: the wheels turn only after cmd/arm (`omnid arm`), again after each stop and each "
@@ -60,14 +45,6 @@ class ControllerSettings:
     trust: TrustSettings = field(default_factory=TrustSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
     collision: CollisionSettings = field(default_factory=CollisionSettings)
-
-    @property
-    def of_replay(self) -> ControllerSettings:
-        """The settings of a replay, which cannot be armed from outside.
-
-        It arms itself, also after faults that have passed: to start a replay with a motor is to ask for its motion.
-        """
-        return replace(self.of_log, arming=AUTOMATIC)
 
     @property
     def of_log(self) -> ControllerSettings:

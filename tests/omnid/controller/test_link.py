@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.controller.controller import Controller
 from omnid.controller.ipc import Channel, ControllerStart, ControllerState, ControllerUpdate, TickReport, socket_pair
@@ -297,20 +297,16 @@ def _has_open(base: Base) -> bool:
     return False
 
 
-def test_raises_the_drivers_error_where_the_port_does_not_exist_and_is_not_waited_for() -> None:
-    with pytest.raises(DriverError, match=r"motor port '/dev/nothing'.*there is no such port"):
-        ControllerLink(start_message("/dev/nothing")._replace(waits=True), StageStats(), print)
-
-
 @pytest.mark.hazard("H04")
 def test_a_motor_controller_that_comes_late_or_again_drives_only_after_it_was_armed(tmp_path: Path) -> None:
     port, lines = tmp_path / "motor", list[str]()
     start = start_message(port, MANUAL)
     motor = replace(start.motor, boot_s=1.0, watchdog_ms=500)
-    with contextlib.closing(ControllerLink(start._replace(motor=motor), StageStats(), lines.append)) as link:
+    link = ControllerLink(start._replace(motor=motor), StageStats(), lines.append)
+    with ThreadPoolExecutor() as threads, contextlib.closing(link):
+        reading = threads.submit(list, link.commands())
 
         def state(*, arm: bool = True) -> ControllerState:
-            link.receive_waiting()
             link.send(pose())
             if arm and not link.statistics.state.armed:
                 link.send(ArmRequest(time.monotonic_ns(), 1))
@@ -332,6 +328,7 @@ def test_a_motor_controller_that_comes_late_or_again_drives_only_after_it_was_ar
                 port.unlink()
             wait_until(lambda: state().failed and not state().armed, "the fault")
         link.end()
+        reading.result()
     assert "the motor controller answers" in lines and "the motor controller is back" in lines
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from struct import unpack_from
 from types import SimpleNamespace
@@ -16,21 +15,16 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from drivers.motor import VelocityCommand
 from omnid.client import Robot
-from omnid.controller.link import ControllerStatistics
-from omnid.core.control.arming import TimedSetpoint
-from omnid.core.control.control_law import ControllerPose
+from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.types.panorama import PaddedPanorama
-from omnid.engine.graph import StageStats
 from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.sinks.drive import ReplayDrive, navigation_answers, send_setpoint
+from omnid.sinks.drive import navigation_answers, send_setpoint
 from omnid.sinks.encoder import BusSink, Encoder, Outgoing, PanoramaSink
-from omnid.tracking_state import TrackingState
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PlanarPath, decode_pose
 from omnid.transport.topics import Answer
@@ -170,62 +164,20 @@ AHEAD = Setpoint(0.3, 0.0)
 
 
 class Link:
-    """A link without a process, which keeps what it sends."""
+    """A link without a process, which keeps the setpoints that it sends."""
 
     def __init__(self) -> None:
-        self.poses: list[ControllerPose] = []
-        self.setpoints: list[tuple[Setpoint, int]] = []
-        self.statistics = ControllerStatistics(StageStats())
-        self.ended = False
-
-    def send(self, given: ControllerPose | TimedSetpoint) -> None:
-        if isinstance(given, ControllerPose):
-            self.poses.append(given)
-        else:
-            self.setpoints.append((given.setpoint, given.arrival_ns))
-
-    def receive_waiting(self) -> None:
-        """Nothing waits."""
-
-    def end(self) -> None:
-        self.ended = True
-
-    def commands(self) -> Iterator[VelocityCommand]:
-        assert self.ended, "the process is asked to end before its end is awaited"
-        return iter(())
+        self.setpoints: list[TimedSetpoint] = []
+        self.send = self.setpoints.append
 
 
-def pose_at(stamp_ns: int) -> OdometryUpdate:
-    depth: Any = None
-    return OdometryUpdate(
-        0, stamp_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0, 99, 99, depth
-    )
-
-
-@pytest.fixture
-def link() -> Any:
-    return Link()
-
-
-def rig_health(is_checking: bool = False) -> Any:
-    return SimpleNamespace(is_checking=is_checking)
-
-
-def test_no_pose_of_a_replay_drives_before_its_rig_is_checked(link: Any) -> None:
-    health = rig_health(is_checking=True)
-    drive = ReplayDrive(link, AHEAD, np.eye(4), health)
-    drive.process(pose_at(10**18))
-    assert not link.poses and not link.setpoints
-    for health.is_checking in (False, True):  # a later check stops nothing
-        drive.process(pose_at(10**18 + 10**8))
-    assert len(link.poses) == len(link.setpoints) == 2
-
-
-def test_setpoints_and_answers_of_the_navigation_are_sent(link: Any) -> None:
+def test_setpoints_and_answers_of_the_navigation_are_sent() -> None:
+    link: Any = Link()
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
     refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
     assert navigation_answers(update) == {4: Answer(True, "accepted; navigation: paused: by a request")}
     assert navigation_answers(refused) == {5: Answer(False, "no route lost")}
     for each in (update, refused):
         send_setpoint(link, each)
-    assert len(link.setpoints) == 1
+    (sent,) = link.setpoints
+    assert (sent.setpoint, sent.source) == (AHEAD, PLANNER)

@@ -13,6 +13,7 @@ from omnid.core.control import safety_rules
 from omnid.core.control.arming import (
     AUTOMATIC,
     LOWER_PRIORITY,
+    MANUAL,
     OPERATOR,
     OTHER_SENDER,
     PLANNER,
@@ -93,10 +94,9 @@ def test_a_stick_that_is_held_leads_no_farther_however_small_the_first_step(
 
 def test_where_the_images_are_those_of_a_log_neither_motion_nor_obstacles_are_compared() -> None:
     settings = ControllerSettings()
-    for of in (settings.of_log, settings.of_replay):
-        assert not of.motion.check and not of.collision.check
+    assert not settings.of_log.motion.check and not settings.of_log.collision.check
     assert settings.motion.check and settings.collision.check and settings.without_obstacles.motion.check
-    assert settings.of_replay.arming == AUTOMATIC
+    assert settings.of_log.arming == MANUAL
 
 
 # The safety rules: order, deadlines, and numbers that are not finite.
