@@ -19,6 +19,7 @@ from queue import SimpleQueue
 from typing import ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib import se3
 from calib.models.camera import Array, Mask
@@ -35,7 +36,7 @@ from omnid.core.control.arming import ArmRequest, ContactState, TimedSetpoint
 from omnid.core.control.collision_monitor import ControllerScan
 from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.simulation.rendering.ray_caster import Floats, MountedSensor, Sensor, render_grey
+from omnid.simulation.rendering.ray_caster import Floats, Sensor, render_grey
 from omnid.simulation.world import Walkers, World, clearance_m
 
 CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.
@@ -97,22 +98,20 @@ class SimulatedCameras:
 
     def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int, samples: int) -> None:
         """samples: per pixel and axis."""
-        self.world, self.samples, self._seed = world, samples, seed
+        self.world, self.sensor, self.samples, self._seed = world, sensor, samples, seed
         self.mounted = {"lower": rig.lower, "upper": rig.upper}
-        self._sensors = {
-            name: MountedSensor(sensor, mounted.visible, mounted.camera.size) for name, mounted in self.mounted.items()
-        }
 
     def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers) -> Frame:
         """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
         ideal = self.ideal(camera, T_world_rig, people) * np.float32(self.world.light_at(people.time_s))
         rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
-        width, height = self.mounted[camera].camera.size
-        sensor = self._sensors[camera]
-        image = sensor.expose(ideal, rng)
-        if sensor.sensor.is_compressed:
-            return Frame(seq, stamp_ns, camera, "jpeg", sensor.jpeg(image), width, height)
-        return Frame(seq, stamp_ns, camera, "mono8", image, width, height)
+        return Frame(
+            seq, stamp_ns, camera, "mono8", self.exposed(camera, ideal, rng), *self.mounted[camera].camera.size
+        )
+
+    def exposed(self, camera: Camera, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """Return the sensor's image (H, W) of an ideal one."""
+        return self.sensor.expose(ideal, rng)
 
     def ideal(self, camera: Camera, T_world_rig: Array, people: Walkers) -> Floats:
         """Return the image (H, W) without the errors of a sensor."""

@@ -42,18 +42,12 @@ class Person:
 
     faces: tuple[Rectangle, ...]  # in a frame on the floor below the middle, x ahead
     walk: Walker
-    rests_s: tuple[float, ...] = ()  # at the points of a path that is walked once; none: does not rest
 
     def place(self, walked_s: float) -> tuple[float, float, float]:
         """Return x, y [m] and heading [rad] after a time of walking."""
         points = np.array(self.walk.path)
         reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         along_m, back, total_m = self.walk.speed_mps * max(walked_s, 0.0), False, float(reached_m[-1])
-        if self.rests_s:
-            rested_s = np.cumsum(self.rests_s)
-            arrives_s = reached_m / self.walk.speed_mps + rested_s - self.rests_s
-            times_s = np.column_stack([arrives_s, arrives_s + self.rests_s]).ravel()
-            along_m = float(np.interp(walked_s, times_s, np.repeat(reached_m, 2)))
         if self.walk.repeat != "once" and total_m > 0.0:
             laps, along_m = divmod(along_m, total_m)
             back = self.walk.repeat == "back and forth" and laps % 2 == 1

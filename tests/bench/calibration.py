@@ -40,13 +40,14 @@ from omnid.cli import main as omnid_main
 from omnid.core.rig.rig_health import RigState
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.rendering.ray_caster import MountedSensor, Sensor
+from omnid.simulation.rendering.ray_caster import Sensor
 from tests.bench.results import ResultTable, columns, run
 from tests.simulation import corridor, paths
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
 from tests.simulation.logs import write_log
 from tests.simulation.recipes import build, mild_rig
 from tests.simulation.rigs import with_real_mirrors
+from tests.simulation.sensors import jpeg
 
 FAMILY = "rigs of boards"
 BOARD = Board(9, 6, 0.05)
@@ -71,9 +72,8 @@ def render_boards(seed: int, amount: float, folder: Path, shape: PrintShape = AS
     renderers = {name: BoardRenderer(BOARD, mounted, shape) for name, mounted in sides}
     for k, T in enumerate(board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)):
         made = {name: one.render_board(T, seed=1000 * seed + k, sensor=SENSOR) for name, one in renderers.items()}
-        for name, mounted in sides:
-            jpeg = MountedSensor(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
-            (folder / f"{name}_{k:02d}.jpg").write_bytes(jpeg)
+        for name, _ in sides:
+            (folder / f"{name}_{k:02d}.jpg").write_bytes(jpeg(made[name].image))
     (folder / "rendered").touch()
 
 

@@ -13,8 +13,9 @@ from calib import se3
 from calib.boards.board import AS_DRAWN, AprilGrid, Board, PrintShape
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
-from omnid.simulation.rendering.ray_caster import MountedSensor, Sensor, render_grey
+from omnid.simulation.rendering.ray_caster import Sensor, render_grey
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, value_noise
+from tests.simulation.sensors import MountedSensor
 
 # Side of a square in the board's texture.
 SQUARE_PX = 24

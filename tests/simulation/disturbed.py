@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calib import se3
 from calib.models.camera import Array
@@ -23,6 +24,7 @@ from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedCameras, SimulatedRobot, Vehicle
 from omnid.simulation.world import Walkers, World
 from tests.simulation.disturbances import Mirror, seen_part
+from tests.simulation.sensors import MountedSensor, jpeg
 
 HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor
 WHEEL_M: Final = 0.05  # A wheel rounds off the heights within this distance.
@@ -120,6 +122,14 @@ class BuildingCameras(SimulatedCameras):
     is_dark = False
 
     @cached_property
+    def sensors(self) -> dict[str, MountedSensor]:
+        """The sensor of each camera with what is before it."""
+        return {
+            name: MountedSensor(self.sensor, mounted.visible, mounted.camera.size)
+            for name, mounted in self.mounted.items()
+        }
+
+    @cached_property
     def mirrors(self) -> dict[str, Mirror]:
         """What each camera sees in mirrors."""
         return {name: Mirror(mounted) for name, mounted in self.mounted.items()}
@@ -136,6 +146,17 @@ class BuildingCameras(SimulatedCameras):
                 shown = seen_part(lit, scene, self.mounted[camera], T_world_rig, self.samples)
                 ideal = np.asarray(ideal * (1 + np.float32(patch.gain) * shown), np.float32)
         return ideal * np.float32(not self.is_dark)
+
+    def exposed(self, camera: Camera, ideal: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """Return the image (H, W) of a sensor with what is before it."""
+        return self.sensors[camera].expose(ideal, rng)
+
+    def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers) -> Frame:
+        """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
+        frame = super().frame(camera, seq, stamp_ns, T_world_rig, people)
+        if not self.sensors[camera].sensor.is_compressed:
+            return frame
+        return replace(frame, encoding="jpeg", data=jpeg(np.asarray(frame.data)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,6 @@ import numpy as np
 from calib.models.camera import Array
 from drivers.motors.simulated_motor import Pose
 from omnid.errors import OmnidError
-from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.simulation.rendering.surfaces import Point, Rectangle
 from omnid.simulation.robot import SimulatedRobot, make_robot
 from omnid.simulation.world import Person, Walker
@@ -36,6 +35,7 @@ from tests.simulation.building_parts import (
     trolley,
 )
 from tests.simulation.disturbed import BuildingWorld, Ground, SunPatch, disturbed
+from tests.simulation.sensors import FlawedSensor
 
 # Names of floors, with the kinds of their textures.
 FLOORS: Final = {
@@ -53,7 +53,7 @@ FLOORS: Final = {
 PATTERNED: Final = ("marbled", "carpet", "parquet_across")  # floors of worlds in which something else is tried
 FREE_M: Final = 0.36  # from the middle of a base to what stands beside a way that it can surely drive
 CELL_M: Final = 0.05
-SENSOR: Final = Sensor(vignette=0.25, flicker=0.005, is_compressed=True)
+SENSOR: Final = FlawedSensor(vignette=0.25, flicker=0.005, is_compressed=True)
 # Rays along a side of an image: with two a pixel and axis at 512 px, joints of tiles come and go from pixel to pixel,
 # as no lens shows them; with three they do not.
 SIDE_RAYS: Final = 3 * 512

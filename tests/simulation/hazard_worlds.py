@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -276,6 +276,21 @@ def _standing(b: Builder, height_m: float) -> Trial:
     return _people(b, Person(b.adult(height_m), Walker(path, 0.0)))
 
 
+@dataclass(frozen=True, slots=True)
+class RestingPerson(Person):
+    """A person who rests at the points of a path that is walked once."""
+
+    rests_s: tuple[float, ...]
+
+    def place(self, walked_s: float) -> tuple[float, float, float]:
+        """Return x, y [m] and heading [rad] after a time of walking and resting."""
+        lengths_m = np.linalg.norm(np.diff(np.array(self.walk.path), axis=0), axis=1)
+        reached_s = np.concatenate([[0.0], np.cumsum(lengths_m)]) / self.walk.speed_mps
+        leaves_s = reached_s + np.cumsum(self.rests_s)
+        times_s = np.column_stack([leaves_s - self.rests_s, leaves_s]).ravel()
+        return Person.place(self, float(np.interp(walked_s, times_s, np.repeat(reached_s, 2))))
+
+
 def _leads(b: Builder, *, comes_back: bool) -> Trial:
     """Somebody walks ahead of the robot and stops, or then steps back towards it."""
     _wide_corridor(b)
@@ -284,9 +299,8 @@ def _leads(b: Builder, *, comes_back: bool) -> Trial:
     rests_s: tuple[float, ...] = (0.0, b.rng.uniform(0.5, 2.5))
     if comes_back:
         path, rests_s = (*path, (stop_m - 0.6, y_m)), (*rests_s, 0.0)
-    return _people(
-        b, Person(b.adult(), Walker(path, b.rng.uniform(0.5, 0.8), start_s=b.rng.uniform(2.0, 4.0)), rests_s)
-    )
+    faces, speed_mps = b.adult(), b.rng.uniform(0.5, 0.8)
+    return _people(b, RestingPerson(faces, Walker(path, speed_mps, start_s=b.rng.uniform(2.0, 4.0)), rests_s))
 
 
 def _steps_in(b: Builder, within_cm: str) -> Trial:

@@ -16,10 +16,11 @@ from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.simulation.rendering.ray_caster import Floats, MountedSensor, Sensor, render_grey
+from omnid.simulation.rendering.ray_caster import Floats, Sensor, render_grey
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation.disturbances import Disturbance, DisturbedCamera
 from tests.simulation.rigs import MirrorCamera, nominal_rig
+from tests.simulation.sensors import MountedSensor, jpeg
 
 
 def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
@@ -141,12 +142,12 @@ def write_log(
     else:
         write_rig(folder / "rig.toml", rig)
 
-    def jpeg(pair: int, camera: int) -> bytes:
+    def encoded(pair: int, camera: int) -> bytes:
         exposed = exposures[camera].expose(ideal_image(pair, camera), rng)
         image = disturbed[camera].digitised(exposed)
-        return disturbed[camera].encoded(image, pair) or exposures[camera].jpeg(image)
+        return disturbed[camera].encoded(image, pair) or jpeg(image)
 
-    images = ((i, jpeg(i, 0), jpeg(i, 1)) for i in range(len(poses)))
+    images = ((i, encoded(i, 0), encoded(i, 1)) for i in range(len(poses)))
     # log.mcap appears only when it is complete.
     _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images)
     (folder / "log.mcap.part").replace(folder / "log.mcap")

@@ -15,10 +15,11 @@ from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation import paths
 from tests.simulation.builders import KEPT, bricks, corridor, ring, room, symmetric_room, twin_corridor, two_laps_path
 from tests.simulation.rigs import make_rig
+from tests.simulation.sensors import FlawedSensor
 
 TURN_DEG = 94.0
 # Mean grey of about 30 of 255; the brightness of each image differs by 20 %.
-DIM = Sensor(noise_sigma=5.0, vignette=0.4, flicker=0.2, brightness=0.3)
+DIM = FlawedSensor(noise_sigma=5.0, vignette=0.4, flicker=0.2, brightness=0.3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,7 @@ def turns(seed: int, size: int, pairs: int) -> SimulatedRun:
 def struts(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return two_walls seen by a mirror on three struts with a hub, vignetting and changing light."""
     run = two_walls(seed, size, pairs)
-    sensor = Sensor(strut_angles_deg=(35.0, 155.0, 275.0), hub=0.07, vignette=0.3, flicker=0.03)
+    sensor = FlawedSensor(strut_angles_deg=(35.0, 155.0, 275.0), hub=0.07, vignette=0.3, flicker=0.03)
     return SimulatedRun(run.rig, run.poses, run.scene, sensor)
 
 

@@ -27,6 +27,7 @@ from tests.simulation.boards import (
     print_of,
     render_april_grid,
 )
+from tests.simulation.sensors import FlawedSensor
 
 BOARD = Board(6, 5, 0.03)
 CAMERA = UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480))
@@ -52,7 +53,7 @@ def errors_px(found: Array, truth: Array) -> Array:
     [
         (Sensor(), (25.0, 225.0), 0.08),
         (Sensor(noise_sigma=6.0), (25.0, 225.0), 0.5),
-        (Sensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 0.5),
+        (FlawedSensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 0.5),
     ],
 )
 def test_finds_boards_on_all_sides(sensor: Sensor, contrast: tuple[float, float], limit_px: float) -> None:
