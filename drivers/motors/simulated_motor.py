@@ -1,4 +1,4 @@
-"""A simulated base with two driven wheels: commands, watchdogs, motion; and the driver of its motor controller."""
+"""A simulated base with two driven wheels: commands, watchdog, motion; and the driver of its motor controller."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.protocols.motor_protocol import DifferentialDrive
 
 STEP_S = 0.005  # Step of the integration.
 REACHED = 1e-3  # m/s or rad/s: friction ends the lag
-LEFT, RIGHT = SIDES = (0, 1)
 Pose = tuple[float, float, float]  # x [m], y [m], heading [rad]
 # Travel over the ground [m] of the left and the right wheel for a time [s] and the travel of their rims.
 Traction = Callable[[float, float, float], tuple[float, float]]
@@ -30,59 +28,39 @@ class MotionLimits:
 
 
 class SimulatedBase:
-    """Wheels of a simulated controller, each with its own watchdog; its time is advanced by the caller."""
+    """Wheels of a simulated controller with a watchdog; its time is advanced by the caller."""
 
-    def __init__(self, drive: DifferentialDrive | None = None, limits: MotionLimits | None = None) -> None:
-        self.drive = drive or DifferentialDrive()
-        self.watchdog_ms = 500.0  # 0 is off
-        self.fault = 0
-        self.bumper = self.cliff = False  # contacts that it reports
-        self.battery_v = 12.0
+    def __init__(self, drive: DifferentialDrive, watchdog_ms: float) -> None:
+        self.drive, self.watchdog_ms = drive, watchdog_ms
         self.pose: Pose = (0.0, 0.0, 0.0)
         self.velocity_mps = self.yaw_rate_radps = 0.0
         self.goal_heading_rad: float | None = None  # in the world; steered to during motion, if set
         self.commanded_mps = [0.0, 0.0]  # left, right
-        self.expired = [False, False]  # watchdogs: left, right
-        self._since_command_s = [0.0, 0.0]
-        self.limits = limits or MotionLimits()
+        self.watchdog_expired = False  # it has stopped the wheels
+        self._since_command_s = 0.0
+        self.limits = MotionLimits()
         self.traction: Traction = lambda _, left_m, right_m: (left_m, right_m)
 
-    @property
-    def watchdog_expired(self) -> bool:
-        """True if a watchdog has stopped a wheel."""
-        return any(self.expired)
-
     def command(self, velocity_mps: float, yaw_rate_radps: float) -> None:
-        """Command a motion of the base."""
+        """Command a motion of the base, and feed the watchdog."""
         half_mps = yaw_rate_radps * self.drive.track_m / 2
-        self.command_wheel(LEFT, velocity_mps - half_mps)
-        self.command_wheel(RIGHT, velocity_mps + half_mps)
-
-    def command_wheel(self, side: int, speed_mps: float) -> None:
-        """Command the speed of one wheel, forward positive, and feed its watchdog."""
-        self.expired[side] = False
-        self.commanded_mps[side] = speed_mps
-        self.feed(side)
-
-    def feed(self, side: int) -> None:
-        """Feed the watchdog of one wheel."""
-        self._since_command_s[side] = 0.0
+        self.commanded_mps = [velocity_mps - half_mps, velocity_mps + half_mps]
+        self.watchdog_expired, self._since_command_s = False, 0.0
 
     def advance(self, dt_s: float) -> None:
-        """Advance watchdogs, wheels and pose by dt_s."""
+        """Advance watchdog, wheels and pose by dt_s."""
         steps = math.ceil(dt_s / STEP_S)
         for _ in range(steps):
+            self.watch(dt_s / steps)
             self._step(dt_s / steps)
 
-    def expire(self, side: int) -> None:
-        """Let the watchdog of one wheel stop it."""
-        self.expired[side], self.commanded_mps[side] = True, 0.0
+    def watch(self, dt_s: float) -> None:
+        """Advance the watchdog by dt_s."""
+        self._since_command_s += dt_s
+        if self._since_command_s * 1000 > self.watchdog_ms:
+            self.watchdog_expired, self.commanded_mps = True, [0.0, 0.0]
 
     def _step(self, dt_s: float) -> None:
-        for side in SIDES:
-            self._since_command_s[side] += dt_s
-            if 0.0 < self.watchdog_ms < self._since_command_s[side] * 1000 and not self.expired[side]:
-                self.expire(side)
         velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
         limits = self.limits
         self.velocity_mps += self._step_to(velocity_mps - self.velocity_mps, limits.acceleration_mps2, dt_s)
@@ -124,11 +102,9 @@ class SimulatedMotor:
     """
 
     def __init__(self, drive: DifferentialDrive, watchdog_ms: int, clock_ns: Callable[[], int]) -> None:
-        self.base, self._clock_ns = SimulatedBase(drive), clock_ns
-        self.base.watchdog_ms = watchdog_ms
+        self.base, self._clock_ns = SimulatedBase(drive, watchdog_ms), clock_ns
         self._now_ns = clock_ns()
         self.status: MotorStatus | None = None  # the last reply
-        self.cut = False  # fault: no command arrives
 
     def advance(self) -> None:
         """Let the base move until now."""
@@ -137,15 +113,13 @@ class SimulatedMotor:
         self._now_ns = now_ns
 
     def send(self, command: VelocityCommand) -> MotorStatus:
-        """Command a motion and return the controller's status before it; DriverError where the line is cut."""
+        """Command a motion and return the controller's status before it."""
         self.advance()
-        self.status = None
-        if self.cut:
-            raise DriverError("the simulated motor controller gave no answer")
         base = self.base
         velocity_mps, yaw_rate_radps = base.drive.limited(command)
-        state = base.watchdog_expired, base.fault, base.battery_v, base.bumper, base.cliff
-        self.status = MotorStatus(base.velocity_mps, base.pose[2], base.yaw_rate_radps, *state)
+        self.status = MotorStatus(
+            base.velocity_mps, base.pose[2], base.yaw_rate_radps, base.watchdog_expired, fault=0, battery_v=12.0
+        )
         steers = not is_stop(command) and not base.watchdog_expired
         base.goal_heading_rad = command.heading_rad if steers else None
         base.command(velocity_mps * steers, yaw_rate_radps * steers)
@@ -153,7 +127,6 @@ class SimulatedMotor:
 
     def close(self) -> None:
         """Stop the wheels."""
-        self.cut = False
         self.send(stop_command(0))
 
 

@@ -148,6 +148,7 @@ class Vehicle:
     """
 
     make_cameras: ClassVar[type[SimulatedCameras]] = SimulatedCameras
+    make_motor: ClassVar[type[SimulatedMotor]] = SimulatedMotor
 
     def __init__(
         self,
@@ -166,7 +167,7 @@ class Vehicle:
         self._take_tick = take_tick
         self.cameras = self.make_cameras(robot.rig, robot.sensor, world, seed, robot.samples)
         drive = config.motor.drive
-        self.motor = SimulatedMotor(drive, config.motor.watchdog_ms, lambda: self.now_ns)
+        self.motor = self.make_motor(drive, config.motor.watchdog_ms, lambda: self.now_ns)
         self.base = self.motor.base
         self.base.pose, self.base.limits, self.base.traction = world.start, robot.limits, self.travel_m
         self.controller = Controller(

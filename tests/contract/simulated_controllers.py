@@ -30,14 +30,24 @@ from drivers.motors.protocols.vesc import (
     packet,
 )
 from drivers.motors.serial_motor import PROTOCOLS, SerialMotor
-from drivers.motors.simulated_motor import LEFT, RIGHT, SIDES, STEP_S, SimulatedBase
+from drivers.motors.simulated_motor import STEP_S, SimulatedBase
+
+LEFT, RIGHT = SIDES = (0, 1)
 
 
 class FirmwareBase(SimulatedBase):
-    """Wheels that need a stop after their watchdog has expired, and count what a controller receives."""
+    """Wheels, each with its own watchdog, that need a stop after it has expired, and count what a controller receives.
+
+    watchdog_ms 0 is off.
+    """
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
-        super().__init__(drive)
+        super().__init__(drive or DifferentialDrive(), 500.0)
+        self.fault = 0
+        self.bumper = self.cliff = False  # contacts that it reports
+        self.battery_v = 12.0
+        self.expired = [False, False]  # watchdogs: left, right
+        self._fed_s = [0.0, 0.0]  # time since each watchdog was fed
         self.commands = self.errors = 0  # valid commands, and all that a real controller would reject
         self.expiries = 0  # times that the watchdog has stopped the wheels
         self.unsafe_resumes = 0  # motion commands to a wheel that needed a stop first
@@ -55,17 +65,42 @@ class FirmwareBase(SimulatedBase):
         left_mps, right_mps = self.commanded_mps
         return VelocityCommand(0, (left_mps + right_mps) / 2, 0.0, (right_mps - left_mps) / self.drive.track_m)
 
+    def command(self, velocity_mps: float, yaw_rate_radps: float) -> None:
+        super().command(velocity_mps, yaw_rate_radps)
+        for side, speed_mps in enumerate(self.commanded_mps):
+            self.command_wheel(side, speed_mps)
+
     def command_wheel(self, side: int, speed_mps: float) -> None:
+        """Command the speed of one wheel, forward positive, and feed its watchdog."""
         is_unsafe = self._needs_stop[side] and speed_mps != 0.0
         self.unsafe_resumes += is_unsafe
         self.errors += is_unsafe
         self._needs_stop[side] = False
-        super().command_wheel(side, speed_mps)
+        self.commanded_mps[side] = speed_mps
+        self.set_expired(side, expired=False)
+        self.feed(side)
+
+    def feed(self, side: int) -> None:
+        """Feed the watchdog of one wheel."""
+        self._fed_s[side] = 0.0
 
     def expire(self, side: int) -> None:
+        """Let the watchdog of one wheel stop it."""
         self.expiries += not self.watchdog_expired
         self._needs_stop[side] = True
-        super().expire(side)
+        self.commanded_mps[side] = 0.0
+        self.set_expired(side, expired=True)
+
+    def set_expired(self, side: int, *, expired: bool) -> None:
+        """Note whether the watchdog of one wheel has expired."""
+        self.expired[side] = expired
+        self.watchdog_expired = any(self.expired)
+
+    def watch(self, dt_s: float) -> None:
+        for side in SIDES:
+            self._fed_s[side] += dt_s
+            if 0.0 < self.watchdog_ms < self._fed_s[side] * 1000 and not self.expired[side]:
+                self.expire(side)
 
 
 class SimulatedController(Protocol):
@@ -79,12 +114,12 @@ class SimulatedController(Protocol):
         """Return the replies to received bytes."""
 
 
-def side_of(base: SimulatedBase, channel: int) -> int:
+def side_of(base: FirmwareBase, channel: int) -> int:
     """Return the wheel, LEFT or RIGHT, of a channel, 0 or 1."""
     return RIGHT if bool(channel) != base.drive.swapped else LEFT
 
 
-def command_channel(base: SimulatedBase, channel: int, speed_mps: float) -> None:
+def command_channel(base: FirmwareBase, channel: int, speed_mps: float) -> None:
     """Command the speed of one channel, 0 or 1."""
     side = side_of(base, channel)
     base.command_wheel(side, base.drive.to_sides(speed_mps, speed_mps)[side])
@@ -264,7 +299,7 @@ class SimulatedODrive(SimulatedFirmware):
     def _arm(self, axis: int, name: str, value: float) -> bytes:
         side = side_of(self.base, axis)
         if name == "error":
-            self.base.expired[side] = bool(int(value) & WATCHDOG_EXPIRED)
+            self.base.set_expired(side, expired=bool(int(value) & WATCHDOG_EXPIRED))
         elif value == CLOSED_LOOP and not self.base.expired[side] and not self.base.fault:
             self._state[axis] = CLOSED_LOOP
             command_channel(self.base, axis, self._input_vel[axis] / self.base.drive.turns_per_m)

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.models.camera import Array
+from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from drivers.motors.simulated_motor import Pose
+from drivers.motor import MotorStatus, VelocityCommand
+from drivers.motors.simulated_motor import Pose, SimulatedMotor
 from omnid.config import Config
 from omnid.simulation import lockstep
 from omnid.simulation.lockstep import Drive, SimulatedRun
@@ -206,10 +208,30 @@ class Fault:
 Tamper: TypeAlias = Callable[[float, Frame], Frame]
 
 
+class CuttableMotor(SimulatedMotor):
+    """A motor controller that gets no command while its line is cut."""
+
+    cut = False
+
+    def send(self, command: VelocityCommand) -> MotorStatus:
+        """Command a motion and return the controller's status before it; DriverError where the line is cut."""
+        if self.cut:
+            self.advance()
+            self.status = None
+            raise DriverError("the simulated motor controller gave no answer")
+        return super().send(command)
+
+    def close(self) -> None:
+        """Stop the wheels."""
+        self.cut = False
+        super().close()
+
+
 class DisturbedVehicle(Vehicle):
     """A vehicle with what disturbs its robot, and faults."""
 
     make_cameras: ClassVar[type[SimulatedCameras]] = BuildingCameras
+    make_motor: ClassVar[type[SimulatedMotor]] = CuttableMotor
     robot: DisturbedRobot
 
     def __init__(self, faults: Iterable[Fault], tamper: Tamper | None, world: World, robot: SimulatedRobot, *args: Any):
@@ -232,7 +254,7 @@ class DisturbedVehicle(Vehicle):
 
     def images(self, seq: int, stamp_ns: int) -> list[Frame]:
         """Return the frames that a fault does not take away."""
-        assert isinstance(self.cameras, BuildingCameras)
+        assert isinstance(self.cameras, BuildingCameras) and isinstance(self.motor, CuttableMotor)
         self.motor.cut, self.cameras.is_dark = self._has("motor cut"), self._has("dark")
         frames = [one for one in super().images(seq, stamp_ns) if not self._has(f"no {one.camera} image")]
         return frames if self.tamper is None else [self.tamper(self.time_s, frame) for frame in frames]

@@ -42,7 +42,8 @@ class LockstepBase:
     """A simulated motor controller that holds headings, as a driver, in the time of the test."""
 
     def __init__(self) -> None:
-        self.base = SimulatedBase(limits=FAST)
+        self.base = SimulatedBase(DifferentialDrive(), 500.0)
+        self.base.limits = FAST
         self.fastest_radps = 0.0
 
     def send(self, command: VelocityCommand) -> MotorStatus:
