@@ -11,9 +11,9 @@ from drivers.errors import DriverError
 from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
-from omnid.controller.ipc import ControllerState, TickReport, cuts_drive_short, transitions
+from omnid.controller.ipc import TickReport, cuts_drive_short, transitions
 from omnid.core.control.arming import BUS, MOTOR, ContactState
-from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerSettings
+from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerSettings, ControllerState
 from omnid.core.control.heading_controller import STOP, Twist
 from omnid.core.control.motion_monitor import Motion
 from omnid.core.control.safety_rules import AWAITED, BUMPER, CLIFF, FAILED, STOPPED
@@ -79,7 +79,8 @@ class Controller:
 
     def tick(self) -> TickReport:
         """Step the law, and send its motion."""
-        state, law = self.state, self._law
+        before, law = self.state, self._law
+        self.state = state = copy(before)  # a state that was reported does not change
         # 1. Keep the rhythm of the earliest tick; ticks whose time has passed are left out.
         now_ns = self._clock_ns()
         dt_ns = now_ns - self._last_ns if self._last_ns else self._period_ns
@@ -92,7 +93,7 @@ class Controller:
         if state.failed:
             motor = FAILED if state.sent else AWAITED
         output = law.step(now_ns, dt_ns * S_PER_NS, late_s=late_s, motor=motor)
-        self._keep_state(output.reason)
+        self._keep_state(before, output.reason)
         # 3. Send its motion, and report to the law what became of it.
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
@@ -109,9 +110,9 @@ class Controller:
         """Stop the wheels at once and release the driver."""
         self._driver.close()
 
-    def _keep_state(self, reason: str) -> None:
+    def _keep_state(self, before: ControllerState, reason: str) -> None:
         """Keep what the law has decided, for the status; count and report what has changed since the last tick."""
-        state, law, before = self.state, self._law, copy(self.state)
+        state, law = self.state, self._law
         state.reason = reason
         arming, commands, monitor = law.arming, law.commands, law.collision
         state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, arming.answer

@@ -6,22 +6,19 @@ start, and a TickReport with its state for each tick.
 
 from __future__ import annotations
 
-import math
 import pickle
 import select
 import socket
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.controller.motor import MotorSettings
-from omnid.core.control.arming import NO_ANSWER, NO_CONTACT, STARTED, ArmAnswer, ContactState
+from omnid.core.control.arming import NO_CONTACT, ContactState
 from omnid.core.control.collision_monitor import remedy
-from omnid.core.control.control_law import ControlInput, ControllerSettings
+from omnid.core.control.control_law import ControlInput, ControllerSettings, ControllerState
 from omnid.core.control.motion_monitor import ADVICE, CONFLICTS, DISAGREEMENTS, MOTION_DOUBTFUL, Conflict
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.engine.process import RealtimeSettings
@@ -65,35 +62,6 @@ class LogRecord(NamedTuple):
 
 UNTIL_ARMED: Final = "they stay stopped until cmd/arm (`omnid arm`)"
 ARMED: Final = "armed by cmd/arm"
-
-
-@dataclass(slots=True)
-class ControllerState:
-    """The state of the controller and its counts since the start."""
-
-    reason: str = IDLE  # why the wheels must stop now; empty: they may turn
-    armed: bool = False
-    disarmed_by: str = STARTED  # empty while armed
-    needs_request: bool = False  # only cmd/arm lets the wheels turn again
-    stop_count: int = 0  # stops and faults that have made cmd/arm necessary
-    stopped_by: str = ""  # reason of the newest of them, kept after arming
-    arm_answer: ArmAnswer = NO_ANSWER
-    source: str = ""  # source of the commands that drive; empty while none does
-    failed: bool = False  # the last command failed
-    problem: str = ""  # why, in words
-    fault: int = 0  # the motor controller's own number
-    battery_v: float = math.nan  # voltage that the motor controller reports
-    slowed_by: str = ""  # why the base drives slowly; empty: it need not
-    measured: str = ""  # by how much the sensors of the motion differ; empty: they agree
-    obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
-    blocked: bool = False  # the collision monitor stops the base: the command leads to an obstacle
-    sent: int = 0  # commands that were answered
-    late: int = 0  # commands whose answer did not come in time; the wheels keep turning
-    errors: int = 0  # commands that failed
-    expiries: int = 0  # how often the motor controller had stopped the wheels by itself
-    missed: int = 0  # ticks that were left out
-    refused: Counter[str] = field(default_factory=Counter)  # commands, by reason
-    stops: Counter[str] = field(default_factory=Counter)  # stops of wheels that turned, by reason
 
 
 def cuts_drive_short(before: ControllerState, after: ControllerState) -> bool:

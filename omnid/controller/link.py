@@ -16,7 +16,6 @@ from omnid.controller.ipc import (
     NO_MESSAGE,
     Channel,
     ControllerStart,
-    ControllerState,
     ControllerUpdate,
     LogRecord,
     StartFailed,
@@ -24,7 +23,7 @@ from omnid.controller.ipc import (
     socket_pair,
 )
 from omnid.core.control.arming import NO_CONTACT
-from omnid.core.control.control_law import ControlInput
+from omnid.core.control.control_law import ControlInput, ControllerState
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.graph import POLL_S, Histogram, StageStats, Stream
 from omnid.engine.process import python, python_environment

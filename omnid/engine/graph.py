@@ -298,10 +298,11 @@ class Graph:
         return stream
 
     def inlet(self, depth: int, thread: str = "") -> Stream[Any]:
-        """Add a stream for messages from outside, which never waits; it ends when all sources have ended.
+        """Add a stream for messages from outside; it ends when all sources have ended.
 
-        depth: number of messages that may wait for each reader; the oldest give way. thread: name of the thread that
-        pushes them, whose stages then run there; empty: any.
+        depth: number of messages that may wait for each reader; the oldest give way, so that the writer never waits.
+        0: as the graph has it for other streams. thread: name of the thread that pushes them, whose stages then run
+        there; empty: any.
         """
         self._inlets.append(Stream(thread, depth))
         return self._inlets[-1]

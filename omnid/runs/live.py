@@ -171,7 +171,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     if controller is not None and config.controller.collision.check and not config.obstacles.enabled:
         session.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from obstacles")
     if controller is not None:
-        states = controller.statistics.states = graph.inlet(1, thread="drive")
+        states = controller.statistics.states = graph.inlet(0, thread="drive")
         if topics.WHEEL_ODOM in subscribed:
             subscribed.discard(topics.WHEEL_ODOM)
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")

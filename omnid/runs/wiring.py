@@ -18,10 +18,9 @@ from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.ipc import ControllerState
 from omnid.controller.link import DriveLink
+from omnid.core.control.control_law import ControllerState
 from omnid.core.navigation.requests import NavigationCommand
-from omnid.core.navigation.situation import WheelState
 from omnid.diagnostics.status import RunStatistics
 from omnid.engine.graph import Graph, Output, Poller, Stream, run_in_thread
 from omnid.engine.robot_clock import RobotClock, log_time
@@ -228,8 +227,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
         of_base = config.controller.collision, T_base_rig, T_base_rect
         map_name = config.places.map if places else ""
         stage = NavigationStage(config.navigation, *of_base, map_name, files.routes, is_new=run_map.is_new)
-        wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
-        inbox: list[Stream[Any] | None] = [poses, in_map, scans, wheels, requests]
+        inbox: list[Stream[Any] | None] = [poses, in_map, scans, states, requests]
         ways = graph.stage("navigation", stage, *(stream for stream in inbox if stream is not None))
         leaving.append(Leaving("navigation", ways))
         answers.append(graph.stage("arming", arming_answers, states, thread=states.thread))
@@ -240,17 +238,3 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
     if inputs.reports is not None:
         leaving.append(Leaving("status", inputs.reports))
     return Streams(pairs, poses, maps, in_map, scans, ways, leaving, answers, places)
-
-
-def wheel_state(state: ControllerState) -> WheelState:
-    """Return the part of the controller's state that the navigation needs."""
-    return WheelState(
-        state.armed,
-        state.needs_request,
-        state.disarmed_by,
-        state.reason,
-        state.source,
-        state.obstacle if state.blocked else "",
-        state.stop_count,
-        state.stopped_by,
-    )

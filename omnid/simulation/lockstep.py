@@ -19,8 +19,8 @@ from calib import se3
 from drivers.frame import Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.ipc import ControllerState
 from omnid.core.control.arming import PLANNER, ArmRequest, TimedSetpoint
+from omnid.core.control.control_law import ControllerState
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
 from omnid.core.nanoseconds import NS_PER_S

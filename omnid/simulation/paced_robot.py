@@ -6,7 +6,6 @@ this one clock. The daemon's messages reach the controller at its ticks, and are
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -128,7 +127,7 @@ class PacedRobot:
 
     def _take_tick(self, tick: Tick, report: TickReport) -> None:
         """Pass a tick on; count and report a contact when it begins."""
-        self.statistics.add(report._replace(state=copy.deepcopy(report.state)))  # the controller changes its own
+        self.statistics.add(report)
         if report.command is not None:
             self._commands.put(report.command)
         touches = tick.clearance_m <= 0

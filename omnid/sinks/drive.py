@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.controller.ipc import ControllerState
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import PLANNER, TimedSetpoint
-from omnid.core.control.control_law import ControllerPose
+from omnid.core.control.control_law import ControllerPose, ControllerState
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.frames import of_base
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.se2_arrays import planar
 from omnid.core.control.collision_monitor import CollisionSettings
+from omnid.core.control.control_law import ControllerState
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.follower import STANDSTILL
@@ -29,7 +30,7 @@ from omnid.core.navigation.requests import (
 )
 from omnid.core.navigation.route import ENTRY_M, KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.situation import MapPosition, Situation, refusal_of_map, refusal_to_drive
 from omnid.core.navigation.surroundings import Surroundings, near_ends
 from omnid.errors import OmnidError
 from omnid.messages import (
@@ -44,7 +45,7 @@ from omnid.messages import (
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
-NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | WheelState | NavigationCommand
+NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | ControllerState | NavigationCommand
 
 REPEAT_NS = NS_PER_S  # An unchanged state is published again after this time.
 SCAN_NS = 2_000_000_000  # Older scans are not used; the collision monitor then stops the base.
@@ -76,7 +77,7 @@ class NavigationStage:
         self._T_rig_base = se3.inverse(T_base_rig)
         self._T_base_rect, self._T_rect_base = T_base_rect, se3.inverse(T_base_rect)
         self.map_name, self._routes, self._is_new = map_name, routes, is_new
-        self._wheels = WheelState(False, False)
+        self._wheels = ControllerState()
         self._navigator = Navigator(settings, collision)
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
@@ -105,7 +106,7 @@ class NavigationStage:
                 self._place(message)
             case ObstacleScan():
                 self._scan = message
-            case WheelState():
+            case ControllerState():
                 self._wheels = message
         return None
 

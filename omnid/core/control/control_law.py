@@ -6,11 +6,22 @@ It reads no clock: time is an argument. The controller process steps it on CLOCK
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 from omnid.core.control import safety_rules
-from omnid.core.control.arming import MANUAL, Arming, ArmRequest, CommandSelector, Contacts, TimedSetpoint
+from omnid.core.control.arming import (
+    MANUAL,
+    NO_ANSWER,
+    STARTED,
+    ArmAnswer,
+    Arming,
+    ArmRequest,
+    CommandSelector,
+    Contacts,
+    TimedSetpoint,
+)
 from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan
 from omnid.core.control.heading_controller import (
     JUMP_RAD,
@@ -82,6 +93,45 @@ class ControllerPose(NamedTuple):
 
 # What the daemon gives the controller; of each kind the newest counts.
 ControlInput: TypeAlias = ControllerPose | ControllerScan | TimedSetpoint | ArmRequest
+
+
+@dataclass(slots=True)
+class ControllerState:
+    """The state of the controller after a tick, and its counts since the start."""
+
+    reason: str = safety_rules.IDLE  # why the wheels must stop now; empty: they may turn
+    armed: bool = False
+    disarmed_by: str = STARTED  # empty while armed
+    needs_request: bool = False  # only cmd/arm lets the wheels turn again
+    stop_count: int = 0  # stops and faults that have made cmd/arm necessary
+    stopped_by: str = ""  # reason of the newest of them, kept after arming
+    arm_answer: ArmAnswer = NO_ANSWER
+    source: str = ""  # source of the commands that drive; empty while none does
+    failed: bool = False  # the last command failed
+    problem: str = ""  # why, in words
+    fault: int = 0  # the motor controller's own number
+    battery_v: float = math.nan  # voltage that the motor controller reports
+    slowed_by: str = ""  # why the base drives slowly; empty: it need not
+    measured: str = ""  # by how much the sensors of the motion differ; empty: they agree
+    obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
+    blocked: bool = False  # the collision monitor stops the base: the command leads to an obstacle
+    sent: int = 0  # commands that were answered
+    late: int = 0  # commands whose answer did not come in time; the wheels keep turning
+    errors: int = 0  # commands that failed
+    expiries: int = 0  # how often the motor controller had stopped the wheels by itself
+    missed: int = 0  # ticks that were left out
+    refused: Counter[str] = field(default_factory=Counter)  # commands, by reason
+    stops: Counter[str] = field(default_factory=Counter)  # stops of wheels that turned, by reason
+
+    @property
+    def held_by(self) -> str:
+        """Why the collision monitor stops the base; empty: it does not."""
+        return self.obstacle if self.blocked else ""
+
+    @property
+    def is_held(self) -> bool:
+        """True if a safety rule stops the wheels now, and not only for want of a command."""
+        return self.reason not in ("", safety_rules.IDLE, safety_rules.COMMAND_STALE)
 
 
 class ControlOutput(NamedTuple):

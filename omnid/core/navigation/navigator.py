@@ -70,7 +70,7 @@ class Drive:
     paths: list[DrivePath]  # paths that are driven one after the other
     follower: Follower  # of the first of them
     resets: int
-    stop_count: int  # WheelState.stop_count at the start, or when a person resumed it
+    stop_count: int  # ControllerState.stop_count at the start, or when a person resumed it
     heading_rad: float  # heading at the last progress
     xy: Array  # last position in odom
     detour: Detour | None = None  # None: it follows the path

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed
-from omnid.core.control.safety_rules import COMMAND_STALE, IDLE
+from omnid.core.control.control_law import ControllerState
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.surroundings import Surroundings
 from omnid.tracking_state import MapState, TrackingState
@@ -17,24 +17,6 @@ Array = NDArray[np.float64]
 
 # A larger sigma means that the pose in the map is unknown: it is a kilometre then.
 UNKNOWN_M: Final = 100.0
-
-
-class WheelState(NamedTuple):
-    """State of the controller of the wheels."""
-
-    armed: bool
-    needs_request: bool  # only cmd/arm lets the wheels turn again
-    disarmed_by: str = ""  # empty while armed
-    reason: str = ""  # why the wheels must stop now; empty: they may turn
-    source: str = ""  # source of the commands that drive; empty while none does
-    held_by: str = ""  # why the collision monitor stops the base; empty: it does not
-    stop_count: int = 0  # stops and faults that have made cmd/arm necessary, those that were armed again included
-    stopped_by: str = ""  # reason of the newest of them
-
-    @property
-    def is_held(self) -> bool:
-        """True if a rule of the controller holds the wheels now."""
-        return self.reason not in ("", IDLE, COMMAND_STALE)
 
 
 class MapPosition(NamedTuple):
@@ -55,7 +37,7 @@ class Situation(NamedTuple):
     yaw_rate_radps: float
     state: TrackingState
     resets: int  # how often odometry has begun again
-    wheels: WheelState
+    wheels: ControllerState
     in_map: MapPosition | None = None  # None: nothing is known yet
     around: Surroundings | None = None  # surroundings of the base; None: unknown
 

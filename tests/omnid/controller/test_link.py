@@ -23,14 +23,14 @@ import pytest
 
 from drivers.motor import VelocityCommand
 from omnid.controller.controller import Controller
-from omnid.controller.ipc import Channel, ControllerStart, ControllerState, ControllerUpdate, TickReport, socket_pair
+from omnid.controller.ipc import Channel, ControllerStart, ControllerUpdate, TickReport, socket_pair
 from omnid.controller.link import ControllerLink
 from omnid.controller.motor import MotorSettings
 from omnid.controller.process import run_controller, run_until_end
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest, TimedSetpoint
 from omnid.core.control.collision_monitor import BLOCKED, SCAN_STALE, CollisionSettings, ControllerScan, remedy
-from omnid.core.control.control_law import ControllerPose, ControllerSettings
+from omnid.core.control.control_law import ControllerPose, ControllerSettings, ControllerState
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.safety_rules import BUMPER, CLIFF, Deadlines
 from omnid.engine.graph import StageStats

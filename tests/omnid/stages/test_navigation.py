@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
+from omnid.core.control.control_law import ControllerState
 from omnid.core.mapping.range_scan import RangeScan
 from omnid.core.navigation.follower import STANDSTILL
 from omnid.core.navigation.navigator import CROSSES
@@ -27,7 +29,6 @@ from omnid.core.navigation.requests import (
 )
 from omnid.core.navigation.route import Route
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import WheelState
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import MapKeyframes, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
@@ -37,7 +38,7 @@ from omnid.sinks.drive import navigation_answers
 from omnid.stages.navigation import NavigationStage
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.topics import Answer
-from tests.omnid.core.navigation.driven_base import Floor
+from tests.omnid.core.navigation.driven_base import ARMED, Floor
 
 T_BASE_RIG = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [0.1, -0.2, 0.9])
 T_MAP_ODOM = transform(np.array([2.0, -1.0, 0.3]))  # of the base's frames
@@ -70,7 +71,7 @@ class Robot:
         self.files = RouteFiles(RouteFolder(folder))
         of_map = {"routes": self.files.routes, **of_map}
         self.stage = fixed_map(NavigationSettings(), CollisionSettings(), T_BASE_RIG, **of_map)
-        self.stage.process(WheelState(True, False))
+        self.stage.process(ARMED)
         self.answers: dict[int, Answer] = {}  # to requests
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
         self.seq = 0
@@ -182,7 +183,7 @@ def test_a_refusal_names_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert "nothing is under way" in refusal(NavigationVerb.RESUME)
     assert "nothing is under way" in refusal(NavigationVerb.PAUSE)
     assert "no route is being taught" in refusal(RouteRequest(RouteAction.FINISH))
-    robot.stage.process(WheelState(False, True, "a stop was asked for"))
+    robot.stage.process(ControllerState(disarmed_by="a stop was asked for", needs_request=True))
     assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))
     assert "there is no route nowhere" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
 
@@ -221,10 +222,10 @@ def test_unknown_floor_that_stops_the_wheels_is_passed(tmp_path: Path) -> None:
     ranges, free = np.full(360, np.inf, np.float32), np.full(360, 6.0, np.float32)
     free[165:195] = 0.6
     robot.see(ranges, free)
-    robot.stage.process(WheelState(True, False, held_by=UNKNOWN))
+    robot.stage.process(replace(ARMED, obstacle=UNKNOWN, blocked=True))
     robot.pass_on()
     assert robot.updates[-1].state is NavigationState.BLOCKED
-    robot.stage.process(WheelState(True, False))
+    robot.stage.process(ARMED)
     robot.pass_on()
     assert robot.updates[-1].state is NavigationState.AVOIDING
 
@@ -343,7 +344,7 @@ def test_no_request_needs_a_file_and_a_stop_ends_a_repetition(tmp_path: Path) ->
 def test_a_request_from_before_a_stop_begins_nothing(tmp_path: Path) -> None:
     robot = teaching(tmp_path)
     robot.send(FINISH)
-    robot.stage.process(WheelState(True, False, stop_count=1))  # a bumper; then it was armed again
+    robot.stage.process(replace(ARMED, stop_count=1))  # a bumper; then it was armed again
     assert robot.send(REPEAT, id=1).state is not NavigationState.DRIVING
     assert "a stop or a fault has come since" in robot.answers[1].text
     assert robot.send(REPEAT, id=2, stops=1).state is NavigationState.DRIVING and robot.answers[2].done

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative
 from omnid.core.control.arming import AUTOMATIC, PLANNER, TimedSetpoint
-from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
+from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings, ControllerState
 from omnid.core.control.motion_monitor import MotionSettings
 from omnid.core.navigation.navigator import Navigation, Navigator
-from omnid.core.navigation.situation import MapPosition, Situation, WheelState
+from omnid.core.navigation.situation import MapPosition, Situation
 from omnid.core.obstacles.grid import CELL_M, SIDE, FloorGrid
 from omnid.tracking_state import MapState, TrackingState
 
@@ -26,12 +26,22 @@ AGE_S = 0.08  # of a pose when it is known
 OWN_M = 0.25  # the base stands on floor
 
 
-def wheel_state(law: ControlLaw) -> WheelState:
-    """Return the state of the wheels, as the daemon reads it from the controller."""
+ARMED = ControllerState(reason="", armed=True, disarmed_by="")
+
+
+def wheel_state(law: ControlLaw) -> ControllerState:
+    """Return the state of the wheels, as the controller makes it of its law."""
     arming, current = law.arming, law.commands.current
     source = "" if law.reason or current is None else current.source
-    held_by = law.collision.reason if law.collision.holds else ""
-    return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source, held_by)
+    return ControllerState(
+        law.reason,
+        arming.armed,
+        arming.reason,
+        arming.needs_request,
+        source=source,
+        obstacle=law.collision.reason,
+        blocked=law.collision.holds,
+    )
 
 
 class Floor:
@@ -109,7 +119,7 @@ class DrivenBase:
         self._coming: list[tuple[float, Situation]] = []
 
     @property
-    def wheels(self) -> WheelState:
+    def wheels(self) -> ControllerState:
         return wheel_state(self.law)
 
     def seen(self) -> Situation:

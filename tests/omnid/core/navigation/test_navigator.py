@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from omnid.core.control.arming import OPERATOR, ArmRequest, TimedSetpoint
+from omnid.core.control.control_law import ControllerState
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.navigator import STOPS, WAITS, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
+from omnid.core.navigation.situation import MapPosition, Situation, refusal_to_drive
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
-from tests.omnid.core.navigation.driven_base import DrivenBase
+from tests.omnid.core.navigation.driven_base import ARMED, DrivenBase
 
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
 
@@ -155,7 +157,7 @@ def test_a_drive_waits_for_the_operator_and_fails_far_from_its_path() -> None:
 
 def test_a_hold_of_the_collision_monitor_is_a_block_with_its_reason() -> None:
     base = driving()
-    wheels = base.wheels._replace(held_by="an obstacle is in the way")
+    wheels = replace(base.wheels, obstacle="an obstacle is in the way", blocked=True)
     answer = base.navigator.step(base.seen()._replace(wheels=wheels))
     assert answer.state is NavigationState.BLOCKED and answer.reason == f"an obstacle is in the way: {WAITS}"
     assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0, "the monitor lets go by itself"
@@ -181,7 +183,7 @@ def test_a_stop_between_two_poses_ends_a_drive_although_it_is_armed_again(
     stopped_by: str, state: NavigationState
 ) -> None:
     base = driving()
-    armed = WheelState(True, False, stop_count=1, stopped_by=stopped_by)
+    armed = replace(ARMED, stop_count=1, stopped_by=stopped_by)
     for _ in range(2):
         assert base.navigator.step(base.seen()._replace(wheels=armed)).state is state
     if state is NavigationState.PAUSED:
@@ -193,7 +195,7 @@ def test_a_stop_between_two_poses_ends_a_drive_although_it_is_armed_again(
 @pytest.mark.parametrize(
     ("change", "frame", "words"),
     [
-        ({"wheels": WheelState(False, True, "not armed since the start")}, "odom", "omnid arm"),
+        ({"wheels": ControllerState(needs_request=True)}, "odom", "omnid arm"),
         ({"state": TrackingState.LOST}, "odom", "odometry is lost"),
         ({"in_map": None}, "map", "not localised"),
         ({"in_map": MapPosition(np.zeros(3), MapState.ODOMETRY_ONLY, 0.01)}, "map", "not localised"),
@@ -210,7 +212,7 @@ def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: 
         0.0,
         TrackingState.TRACKING,
         0,
-        WheelState(True, False),
+        ARMED,
         MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02),
     )._replace(**change)  # type: ignore[arg-type]
     refusal = refusal_to_drive(now, NavigationFrame(frame), 0.3)
