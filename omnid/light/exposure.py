@@ -189,6 +189,8 @@ class ExposureControl:
             gain = "" if setting.gain is None else setting.gain
             stats |= {"state": self._law.state, "steps": self._law.steps, "gain": gain}
             stats["exposure_ms"] = setting.exposure_us * 1e-3
+            if self._law.state != "regulated":
+                stats["_warning"] = f"{self._law.state}: exposure time and gain are at their limits"
         return stats
 
     def _request(self, setting: ExposureSetting | None, stamp_ns: int) -> None:

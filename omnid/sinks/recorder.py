@@ -85,7 +85,7 @@ class Recorder:
     def stats(self) -> dict[str, object]:
         """Return the state of the files, with counts of all that was lost after the inbox."""
         state, names = self.state, ("messages", "lost", "files", "deleted", "problem")
-        return {name: getattr(state, name) for name in names} | {"state": state.status}
+        return {name: getattr(state, name) for name in names} | {"state": state.status, "_error": state.problem}
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""

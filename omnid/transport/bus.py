@@ -26,7 +26,6 @@ from omnid.engine.graph import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.session import ALIVE, PERIOD_S, BusConfig, has_receiver, open_session, reason
-from omnid.transport.status_names import SAME_NAME
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import (
     ARM,
@@ -46,6 +45,10 @@ from omnid.transport.topics import (
 __all__ = ["Bus", "BusConfig"]
 
 _HEARTBEAT_S: Final = 0.5  # rmw_zenoh's
+_SAME_NAME: Final = (
+    "another robot on the bus has this one's name, and both obey the same commands: this one is not armed before the "
+    "other has gone; change bus.robot of one of them"
+)
 
 
 class TopicPublisher:
@@ -158,7 +161,8 @@ class Bus:
         """Return whether the name is unique, and how often others sent too much."""
         rings = [*self._rings, *self._queries.values()]
         # floods: how often a key had more messages than its budget
-        return {"same_name": len(self._namesakes), "floods": sum(ring.floods for ring in rings)}
+        floods, problem = sum(ring.floods for ring in rings), "" if self.is_unique else _SAME_NAME
+        return {"same_name": len(self._namesakes), "floods": floods, "_error": problem, "_ok": "open"}
 
     @property
     def is_unique(self) -> bool:
@@ -246,7 +250,7 @@ class Bus:
             elif key != own:
                 self._namesakes.add(key)
                 if was_unique:
-                    self._warn(SAME_NAME)
+                    self._warn(_SAME_NAME)
                     # Two robots that obey one operator are not what the operator expects.
                     self._on_command(Request(STOP))
 

@@ -1,7 +1,7 @@
 """The entries of `<robot>/status`: names, keys, how severe what a part reports is, and what to do.
 
-A part of the robot gives its numbers and states (`stats()`), with units in their keys; MESSAGES says what they
-mean. A part that is not in MESSAGES gives its message by a key that is the severity: _error, _stale, _warning or _ok.
+A part of the robot gives its numbers and states (`stats()`), with units in their keys, and its message by a key that is
+the severity: _error, _stale, _warning or _ok. Of several messages that are not empty the most severe counts.
 Every number is a value of its own, written as a decimal number. Messages are for people: programs do not parse them,
 and they hold no number that changes from one report to the next. Keys that begin with "_" are not published.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final, TypeAlias
@@ -50,10 +50,6 @@ RUN_ID: Final = secrets.token_hex(4)  # of this program: one that starts again h
 TIMEOUT_S: Final = 1.0  # An older image of a camera, or an older pose, is reported as missing.
 # Share of the pairs that were dark, had lost parts, no sure pose or no place in a queue, from which there is a warning.
 NOTABLE_SHARE: Final = 0.1
-SAME_NAME: Final = (
-    "another robot on the bus has this one's name, and both obey the same commands: this one is not armed before the "
-    "other has gone; change bus.robot of one of them"
-)
 
 
 class Key(StrEnum):
@@ -101,24 +97,6 @@ TICK_LATE: Final = "tick_late"
 Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys, and words
 LEVELS: Final = {"_error": ERROR, "_stale": STALE, "_warning": WARN, "_ok": OK}  # of a message by its key
 
-# What the numbers of a part mean: the first message that is not empty, and its severity.
-MESSAGES: Final[Mapping[str, Mapping[int, Callable[[Stats], object]]]] = {
-    BUS: {
-        ERROR: lambda stats: stats["same_name"] and SAME_NAME,
-        OK: lambda _: "open",
-    },
-    RECORDING: {
-        ERROR: lambda stats: stats["state"] == "stopped" and stats["problem"],
-        OK: lambda stats: stats["problem"] or stats["state"],
-    },
-    EXPOSURE: {
-        WARN: lambda stats: (
-            stats["state"].startswith("too ") and f"{stats['state']}: exposure time and gain are at their limits"
-        ),
-        OK: lambda stats: stats["state"],
-    },
-}
-
 # What to do where a part is not well and gives no advice of its own.
 REMEDIES: Final[Mapping[str, str]] = {
     ODOMETRY: "stop, then drive back slowly to a place that it has seen; check light and mirrors",
@@ -142,7 +120,6 @@ def entry(name: str, stats: Stats) -> DiagnosticStatus:
     """Return the entry of a part: its numbers, and level, words and advice; a part with a state alone reports that."""
     state = str(stats.get(Key.STATE, ""))
     found = [(level, str(stats[key])) for key, level in LEVELS.items() if stats.get(key)]
-    found += [(level, str(text)) for level, text_of in MESSAGES.get(name, {}).items() if (text := text_of(stats))]
     level, message = found[0] if found else (ERROR if state == MapState.LOST else OK, state)
     values = {key: value for key, value in stats.items() if not key.startswith("_")}
     remedy = REMEDIES.get(CAMERAS if name.endswith(" camera") else name)
