@@ -13,8 +13,9 @@ from calib import se3
 from calib.boards.board import AS_DRAWN, AprilGrid, Board, PrintShape
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
-from omnid.simulation.rendering.ray_caster import Sensor, render_grey
+from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, value_noise
+from tests.simulation.real_cameras import render_real
 from tests.simulation.sensors import MountedSensor
 
 # Side of a square in the board's texture.
@@ -147,7 +148,7 @@ def exposed(
     supersample: int = 2,
 ) -> BoardImage:
     """Return the image of a scene with a board that has its points (N, 3) [m] at a pose."""
-    ideal = render_grey(scene, mounted, np.eye(4), supersample)
+    ideal = render_real(scene, mounted, np.eye(4), supersample)
     image = MountedSensor(sensor, mounted.visible, mounted.camera.size).expose(ideal, rng)
     return BoardImage(image, mounted.camera.project(se3.apply(T_cam_board, points)), T_cam_board)
 

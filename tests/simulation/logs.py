@@ -16,16 +16,17 @@ from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.simulation.rendering.ray_caster import Floats, Sensor, render_grey
+from omnid.simulation.rendering.ray_caster import Floats, Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation.disturbances import Disturbance, DisturbedCamera
+from tests.simulation.real_cameras import render_real
 from tests.simulation.rigs import MirrorCamera, nominal_rig
 from tests.simulation.sensors import MountedSensor, jpeg
 
 
 def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
     """Return the image (H, W) uint8 of the camera on a rig at T_world_rig; 0 outside the mask."""
-    return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
+    return np.clip(np.rint(render_real(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
 
 
 PERIOD_NS = 100_000_000
@@ -124,7 +125,7 @@ def write_log(
         parts = []
         for late_s in delays_s:
             T_world_rig = poses[pair] @ se3.exp(twists[pair] * late_s)
-            parts.append(render_grey(scene, cameras[camera], T_world_rig, supersample, row_twist))
+            parts.append(render_real(scene, cameras[camera], T_world_rig, supersample, row_twist))
         time_s = 1e-9 * readout.period_ns * pair + delay_s[pair] * camera
         return disturbed[camera].shown(np.mean(parts, axis=0, dtype=np.float32), time_s)
 

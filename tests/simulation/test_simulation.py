@@ -13,8 +13,9 @@ from calib.models.camera import Mask
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.world import clearance_m
-from tests.simulation import build, corridor, render, render_grey, write_log
+from tests.simulation import build, corridor, render, write_log
 from tests.simulation.hazard_worlds import HAZARDS, trial
+from tests.simulation.real_cameras import render_real
 from tests.simulation.rigs import MirrorCamera, with_real_mirrors
 
 SIZE = 96
@@ -41,9 +42,9 @@ def test_same_seed_gives_same_bytes(tmp_path: Path) -> None:
 def test_every_row_of_a_rolling_shutter_has_its_own_pose(amount: float) -> None:
     run, twist = build("two_walls", 4, SIZE, 3), np.array([2e-3, 1e-3, -5e-4, 4e-4, -3e-4, 2e-3])
     upper = (with_real_mirrors(run.rig, 4, amount) if amount else run.rig).upper
-    rolled, still = (render_grey(run.scene, upper, run.poses[1], 3, by) for by in (twist, None))
+    rolled, still = (render_real(run.scene, upper, run.poses[1], 3, by) for by in (twist, None))
     for row in (0, 20, 48, 90):
-        there = render_grey(run.scene, upper, run.poses[1] @ se3.exp(row * twist), 3)
+        there = render_real(run.scene, upper, run.poses[1] @ se3.exp(row * twist), 3)
         apart, moved = (np.abs(image[row] - there[row]) for image in (rolled, still))
         assert np.percentile(apart, 90) < 2
         assert row == 0 or apart.mean() < 0.2 * moved.mean()

@@ -1,9 +1,8 @@
 """Ray caster: the rays of a camera as a table, images of rectangles with textures along them, errors of a sensor.
 
-The camera's lift() defines the rays of a central camera. A non-central one has a ray of its own, with its own origin,
-for every pixel. Rays are cast in square tiles, and a rectangle is intersected only with the rays of the tiles whose
-cone of directions overlaps the pyramid through its corners, unless all of them meet something nearer. With a rolling
-shutter every row has a pose of its own.
+The camera's lift() defines the rays, which meet in its origin; a table may give each ray an origin of its own. Rays are
+cast in square tiles, and a rectangle is intersected only with the rays of the tiles whose cone of directions overlaps
+the pyramid through its corners, unless all of them meet something nearer.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -35,22 +34,15 @@ SMALLEST_PX = 8
 
 
 # 1. The rays of a camera.
-@runtime_checkable
-class NonCentralCamera(Protocol):
-    """A camera whose rays do not meet in one point."""
-
-    def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Return origins (N, 3) [m] and unit directions (N, 3) of pixels (N, 2), in the camera frame."""
-
-
 @dataclass(frozen=True, slots=True)
 class RayTable:
     """The rays of one camera's visible samples by square tiles, row by row; N samples, M tiles, some of them empty."""
 
     rays: Floats  # (3, N) unit, camera frame
-    origins: Floats  # (3, N) [m] camera frame; (3, 1) zero where all rays start at the camera's origin
+    origins: Floats  # (3, N) [m] camera frame; (3, TILE_PX^2) zeros where all rays start at the camera's origin
     spacing: Floats  # (N,) [rad] to the next sample, the root of the sample's solid angle
-    index: NDArray[np.int32]  # (2, N) of the pixel in the flattened image, and of the row of samples
+    pixel: NDArray[np.int32]  # (N,) index in the flattened image
+    sample: NDArray[np.int32]  # (N,) number of the sample, of all of the image row by row
     starts: NDArray[np.int64]  # (M + 1,) first sample of each tile
     axes: Array  # (M, 3) unit; zero for an empty tile
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
@@ -80,8 +72,8 @@ def ray_table(camera: OmniCamera, mask: Mask, supersample: int) -> RayTable:
     """Return the rays of all samples (supersample^2 per pixel) inside a camera's mask, by tiles."""
     width, height = (side * supersample for side in camera.size)
     columns, lines = -(-width // TILE_PX), -(-height // TILE_PX)
-    rays, origins, spacing = _lifted(camera, supersample)  # type: ignore[arg-type]  # cameras are frozen
-    seen = mask.contains(_sample_pixels(camera.size, supersample))
+    rays, spacing = _lifted(camera, supersample)  # type: ignore[arg-type]  # cameras are frozen
+    seen = mask.contains(sample_pixels(camera.size, supersample))
     row, column = np.divmod(np.arange(height * width), width)
     tile = row // TILE_PX * columns + column // TILE_PX
     index = np.flatnonzero(seen & np.isfinite(rays[:, 0]) & np.isfinite(spacing))
@@ -90,33 +82,33 @@ def ray_table(camera: OmniCamera, mask: Mask, supersample: int) -> RayTable:
     pixel = row[index] // supersample * (width // supersample) + column[index] // supersample
     return RayTable(
         np.ascontiguousarray(rays[index].T),
-        np.ascontiguousarray((origins if len(origins) == 1 else origins[index]).T),
+        np.zeros((3, TILE_PX**2), np.float32),
         spacing[index],
-        np.stack([pixel, row[index]]).astype(np.int32),
+        pixel.astype(np.int32),
+        index.astype(np.int32),
         starts,
         *_cones(rays[index], starts),
     )
 
 
-def _sample_pixels(size: tuple[int, int], supersample: int) -> Array:
+def sample_pixels(size: tuple[int, int], supersample: int) -> Array:
     """Return the pixels (N, 2) of all samples, row by row."""
     u, v = ((np.arange(side * supersample) + 0.5) / supersample - 0.5 for side in size)
     return np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
 
 
 @lru_cache(1)
-def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats, Floats]:
-    """Return rays (N, 3), origins (N, 3) and the angle between neighbours (N,) of every sample, row by row.
+def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats]:
+    """Return rays (N, 3) and the angle between neighbours (N,) of every sample, row by row.
 
-    Origins (1, 3) of a central camera. Computed once for the equal lenses of a rig.
+    Computed once for the equal lenses of a rig.
     """
     width, height = camera.size
-    pixels = _sample_pixels(camera.size, supersample)
+    pixels = sample_pixels(camera.size, supersample)
     rays = camera.lift(pixels)
     grid = rays.reshape(height * supersample, width * supersample, 3)
     solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
-    origins = camera.rays(pixels)[0] if isinstance(camera, NonCentralCamera) else np.zeros((1, 3))
-    return rays.astype(np.float32), origins.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
+    return rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
 
 
 def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -131,40 +123,34 @@ def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
 
 
 # 2. An image.
-def render_grey(
-    scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2, row_twist: Array | None = None
-) -> Floats:
+def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
     """Return the ideal image (H, W) float32, 0 to 255; 0 outside the mask and for rays that hit no rectangle.
 
-    supersample: rays of a pixel, per axis. row_twist (6,): motion of the rig in its own frame from one image row to the
-    next (rolling shutter).
+    supersample: rays of a pixel, per axis.
     """
-    table, (width, height) = cached_rays(mounted, supersample), mounted.camera.size
-    # 1. The poses of the camera, of which there is one if it rests, and its largest turn.
-    poses, turned_rad = T_world_rig[None], 0.0
-    if row_twist is not None and np.any(row_twist):
-        rows = (np.arange(height * supersample) + 0.5) / supersample - 0.5
-        poses = T_world_rig @ se3.exp(rows[:, None] * row_twist)
-        turned_rad = height * float(np.linalg.norm(row_twist[3:]))
-    poses = poses @ se3.inverse(mounted.T_cam_rig)
+    T_world_cam = T_world_rig @ se3.inverse(mounted.T_cam_rig)
+    return render_rays(scene, cached_rays(mounted, supersample), T_world_cam, mounted.camera.size, supersample)
+
+
+def render_rays(scene: Scene, table: RayTable, T_world_cam: Array, size: tuple[int, int], supersample: int) -> Floats:
+    """Return the ideal image (H, W) of the rays of a camera at T_world_cam; size: (width, height)."""
+    width, height = size
+    # 1. The rectangles in the camera frame by their least distance, and those that tiles may see.
     reach_m = float(np.linalg.norm(table.origins, axis=0).max())
-    reach_m += float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
-    # 2. The rectangles in the frame of the first pose by their least distance, and those that tiles may see.
-    corners = se3.apply(se3.inverse(poses[0]), np.array([r.corners for r in scene]))
+    corners = se3.apply(se3.inverse(T_world_cam), np.array([r.corners for r in scene]))
     distance_m = _distances_m(corners)
     order = np.argsort(distance_m, kind="stable")
     corners, distance_m = corners[order], distance_m[order]
-    surfaces = _surfaces([scene[i] for i in order], poses[0], distance_m - reach_m)
-    seen = tiles_that_see(table, corners, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
-    # 3. The greys of all samples.
+    surfaces = _surfaces([scene[i] for i in order], T_world_cam, distance_m - reach_m)
+    seen = tiles_that_see(table, corners, np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
+    # 2. The greys of all samples.
     atlas, image = cached_atlas([r.texture for r in scene]), np.zeros(width * height, np.float32)
     cast(
         table.rays,
         table.origins,
         table.spacing,
-        table.index,
+        table.pixel,
         table.starts,
-        np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]),
         np.ascontiguousarray(seen),
         surfaces,
         atlas.pyramids[order],

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from omnid.core.compiled import compiled, inner
 
 Floats = NDArray[np.float32]
-Doubles = NDArray[np.float64]
 Whole = NDArray[np.int64]
 Numbers = NDArray[np.int32]
 Rows = tuple[Floats, Floats, Floats]  # x, y, z (N,), each contiguous: loops over columns become vector instructions
@@ -38,18 +37,6 @@ def bilinear(texels: NDArray[np.uint8], first: int, size: tuple[int, int], u: np
     top = np.float32(texels[at]) * (ONE - x) + np.float32(texels[at + right]) * x
     bottom = np.float32(texels[at + below]) * (ONE - x) + np.float32(texels[at + below + right]) * x
     return np.float32(top * (ONE - y) + bottom * y)
-
-
-@inner
-def turn(poses: Doubles, row: Numbers, rays: Floats, origins: Floats, turned: Floats, moved: Floats) -> None:
-    """Set rays and origins (3, N) in the frame of the first pose; origins (3, 1) where all are the same."""
-    step = 1 if origins.shape[1] > 1 else 0
-    for i in range(rays.shape[1]):
-        T, x, y, z = poses[row[i] if len(poses) > 1 else 0], rays[0, i], rays[1, i], rays[2, i]
-        a, b, c = origins[0, i * step], origins[1, i * step], origins[2, i * step]
-        for k in range(3):
-            turned[k, i] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z
-            moved[k, i] = T[k, 0] * a + T[k, 1] * b + T[k, 2] * c + T[k, 3]
 
 
 @inner
@@ -124,17 +111,16 @@ def shade(
 
 
 @compiled(
-    "(f4[:, ::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f8[:, :, ::1], b1[:, ::1], f4[:, :, ::1], i8[:, ::1], "
-    "i8[:, ::1], u1[::1], f4[::1])",
+    "(f4[:, ::1], f4[:, ::1], f4[::1], i4[::1], i8[::1], b1[:, ::1], f4[:, :, ::1], i8[:, ::1], i8[:, ::1], "
+    "u1[::1], f4[::1])",
     writes=("image",),
 )
 def cast(
     rays: Floats,
     origins: Floats,
     spacing: Floats,
-    index: Numbers,
+    pixels: Numbers,
     starts: Whole,
-    poses: Doubles,
     seen: NDArray[np.bool_],
     surfaces: Floats,
     pyramids: Whole,
@@ -144,30 +130,25 @@ def cast(
 ) -> None:
     """Add the greys of N samples in M tiles to an image.
 
-    rays (3, N), origins (3, N) [m] in the camera frame, (3, 1) where all are the same; spacing (N,) [rad]; index (2, N)
-    of pixel and pose; starts (M + 1,) of the tiles. poses (H, 3, 4) of the camera in the frame of the first one,
-    (1, 3, 4) where all are the same. seen (M, R): the rectangles that a tile may see. surfaces (R, 4, 4), in that
-    frame, by their least distance. pyramids (R, 2): first level, number of levels; levels (L, 3): first texel, height,
-    width.
+    rays (3, N), origins (3, N) [m] in the camera frame; those that all tiles share have as many columns as the largest
+    one. spacing (N,) [rad]; pixels (N,); starts (M + 1,) of the tiles. seen (M, R): the rectangles that a tile may see.
+    surfaces (R, 4, 4), in the camera frame, by their least distance. pyramids (R, 2): first level, number of levels;
+    levels (L, 3): first texel, height, width.
     """
     tiles = len(starts) - 1
     largest = 0
     for tile in range(tiles):
         largest = max(largest, starts[tile + 1] - starts[tile])
-    moving = len(poses) > 1 or origins.shape[1] > 1
-    turned, moved = np.empty((3, largest), np.float32), np.zeros((3, largest), np.float32)
     nearest, distance = np.empty(largest, np.int32), np.empty(largest, np.float32)
     for tile in range(tiles):
+        # 1. The rays of the tile.
         low, high = starts[tile], starts[tile + 1]
         count = high - low
-        # 1. The rays in the frame of the first pose.
+        first = low if origins.shape[1] == len(spacing) else 0
         ray = rays[0, low:high], rays[1, low:high], rays[2, low:high]
-        origin = moved[0, :count], moved[1, :count], moved[2, :count]
-        if moving:
-            begin = origins[:, low:high] if origins.shape[1] > 1 else origins
-            turn(poses, index[1, low:high], rays[:, low:high], begin, turned, moved)
-            ray = turned[0, :count], turned[1, :count], turned[2, :count]
+        last = first + count
+        origin = origins[0, first:last], origins[1, first:last], origins[2, first:last]
         # 2. The nearest rectangle of each ray, and its grey there.
         near, far, textures = nearest[:count], distance[:count], (pyramids, levels, texels)
         meet(seen[tile], surfaces, ray, origin, near, far)
-        shade(surfaces, ray, origin, spacing[low:high], near, far, textures, index[0, low:high], image)
+        shade(surfaces, ray, origin, spacing[low:high], near, far, textures, pixels[low:high], image)
