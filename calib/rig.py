@@ -64,10 +64,6 @@ class RigCovariance:
         """Return the covariance matrix (P, P) in the parameters' own units."""
         return np.asarray(self.correlation * np.outer(self.sigmas, self.sigmas))
 
-    def sigma(self, name: str) -> float:
-        """Return the standard deviation of a parameter; CalibError if it is not listed."""
-        return float(self.sigmas[self._index(name)])
-
     def select(self, names: Sequence[str]) -> RigCovariance:
         """Return the (marginal) covariance of some parameters, in their order; CalibError if one is not listed."""
         chosen = [self._index(name) for name in names]

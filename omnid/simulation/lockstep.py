@@ -102,11 +102,6 @@ class SimulatedRun:
         touches = np.array([False, *(tick.clearance_m <= 0 for tick in self.ticks)])
         return [self.ticks[at] for at in np.flatnonzero(touches[1:] & ~touches[:-1])]
 
-    @property
-    def clearance_m(self) -> float:
-        """The smallest distance of the robot's outline to an obstacle [m]; 0 or less: contact."""
-        return min(tick.clearance_m for tick in self.ticks)
-
 
 def simulate(
     world: World,

@@ -27,7 +27,6 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from drivers.motor import VelocityCommand
 from drivers.motors.simulated_motor import MotionLimits, Pose, SimulatedMotor
 from omnid.config import Config
 from omnid.controller.controller import Controller
@@ -128,8 +127,6 @@ class Tick(NamedTuple):
 
     time_s: float  # since the start
     pose: Pose  # of the base in the world
-    command: VelocityCommand | None  # that was sent; None where the motor controller did not answer
-    reason: str  # why the wheels must stop; empty where they may turn
     clearance_m: float  # of the robot's outline; 0 or less: contact
 
 
@@ -296,4 +293,4 @@ class Vehicle:
             self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
         walking = self.world.footprints(self.people.faces(), self.robot.height_m)
         nearest_m = min(clearance_m(one, pose[:2], self.robot.radius_m) for one in (self._obstacles, walking))
-        self._take_tick(Tick(self.time_s, pose, report.command, report.state.reason, nearest_m), report)
+        self._take_tick(Tick(self.time_s, pose, nearest_m), report)

@@ -165,7 +165,7 @@ def check(*, seeds: Sequence[int] = (3, 4)) -> None:
         rig = mild_rig(seed, SIZE // 2)
         with TemporaryDirectory() as folder:
             write_log(Path(folder), rig, paths.spline_path(seed, 12, 0.4), corridor(seed, 13.0), seed=seed)
-            finding = check_log(Path(folder) / "log.mcap", rig, BY_NAME)[0].finding
+            finding = check_log(Path(folder) / "log.mcap", rig, BY_NAME).finding
         drift, ratio = finding.drift, math.nan
         if drift is not None:
             ratio = math.sqrt(drift.turn @ np.linalg.solve(drift.covariance[:3, :3], drift.turn) / 3)

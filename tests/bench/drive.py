@@ -35,7 +35,7 @@ from omnid.simulation.robot import START_NS, make_robot
 from omnid.simulation.world import Walker, World, cross_track_m, load_world
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
-from tests.simulation.disturbed import Fault, Slip, disturbed, simulate
+from tests.simulation.disturbed import Fault, Slip, disturbed, least_clearance_m, simulate
 
 Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
 ANSWER_S = 0.5  # after a request, within which no end of its drive is looked for
@@ -121,7 +121,7 @@ def row(case: Case, driven: SimulatedRun) -> list[Cell]:
         100 * cross_track_m(legs, driven.truth_in_odom[:, :2, 3]).max(),
         float(np.linalg.norm(moved, axis=1).sum()),
         len(driven.contacts),
-        driven.clearance_m,
+        least_clearance_m(driven),
         dark(case, driven),
         slip(case, driven),
         "; ".join(dict.fromkeys(stops))[:120],
@@ -273,7 +273,7 @@ def route_row(taught: Array, driven: SimulatedRun) -> list[Cell]:
     p95, most = (np.percentile(off_cm, 95), off_cm.max()) if len(off_cm) else (None, None)
     end_cm = 100 * math.dist(path[-1], taught[-1])
     stops = dict.fromkeys(line for _, line in driven.lines if line.startswith("the wheels stop"))
-    return [p95, most, end_cm, way_m[-1], len(driven.contacts), driven.clearance_m, "; ".join(stops)[:300]]
+    return [p95, most, end_cm, way_m[-1], len(driven.contacts), least_clearance_m(driven), "; ".join(stops)[:300]]
 
 
 def routes(*, seeds: Sequence[int] = (1,), length: float = 33.0, size: int = 512) -> None:

@@ -35,7 +35,7 @@ from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.world import Walkers, clearance_m
 from tests.bench.results import ROOT, ResultTable, columns, commit
-from tests.simulation.disturbed import simulate
+from tests.simulation.disturbed import least_clearance_m, simulate
 from tests.simulation.harmless_worlds import FLOORS, Trial
 from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, trial
 from tests.simulation.photographs import with_photographs
@@ -204,7 +204,7 @@ def judged(run: SimulatedRun, asked: Trial, robot: SimulatedRobot, asked_m: floa
     states = [f"{update.state}: {update.reason}" for update in run.navigation if update.reason]
     ended = "" if is_through else "; ".join([*states[-1:], *(disarmed or stops)[-1:]])
     time_s = float(last_s - began_s)
-    return Drive(asked_m, driven_m, time_s, len(run.contacts), own, run.clearance_m, stopped_m, ended)
+    return Drive(asked_m, driven_m, time_s, len(run.contacts), own, least_clearance_m(run), stopped_m, ended)
 
 
 def _from_hazard_m(run: SimulatedRun, asked: Trial, robot: SimulatedRobot) -> float:

@@ -21,7 +21,7 @@ from tests.bench.results import run
 from tests.simulation.disturbances import DISTURBANCES, Disturbance
 from tests.simulation.logs import Readout, write_log
 from tests.simulation.recipes import DIM, build
-from tests.simulation.rigs import with_real_mirrors
+from tests.simulation.rigs import nominal_rig, with_real_mirrors
 
 
 def render(
@@ -55,7 +55,8 @@ def render(
         disturbances=DISTURBANCES if real else tuple(disturb),
     )
     if any(line_time_us):
-        write_rig(out / "rig.toml", replace(rig, times=ShutterTimes(0.0, 1e-6 * line_time_us[0])))
+        known, name = (nominal_rig(rig), "nominal.toml") if mirrors else (rig, "rig.toml")
+        write_rig(out / name, replace(known, times=ShutterTimes(0.0, 1e-6 * line_time_us[0])))
 
 
 if __name__ == "__main__":

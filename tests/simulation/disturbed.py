@@ -297,3 +297,8 @@ def simulate(
     """Drive in lock-step as omnid's own `simulate`, with what disturbs robot and world; tamper: changes the images."""
     vehicle = partial(DisturbedVehicle, faults, tamper)
     return lockstep.simulate(world, robot, drive, seconds=seconds, seed=seed, config=config, vehicle=vehicle)
+
+
+def least_clearance_m(run: SimulatedRun) -> float:
+    """Return the smallest distance of the robot's outline to an obstacle [m]; 0 or less: contact."""
+    return min(tick.clearance_m for tick in run.ticks)

@@ -120,7 +120,6 @@ class RigFinding:
     matches: int
     tried: int  # points that were searched
     drift: RigDrift | None  # of the upper camera; None: there are fewer than MIN_MATCHES
-    residual_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
 
     @property
     def turn_deg(self) -> float:
@@ -195,7 +194,7 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
         angles = (drift.turn, drift.turn_sigma), (drift.shift, drift.shift_sigma)
         turn, shift = (float(np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma)) for angle, sigma in angles)
         misfit_deg = math.degrees(max(turn, SHIFT_WEIGHT * shift, 0.0))
-        # 2. Residuals in each direction show changed intrinsics.
+        # 2. Residuals in each direction, which no rotation of a camera explains, show changed intrinsics.
         sector = np.floor(cylinder.azimuth(lower[:, 0]) * (SECTORS / math.tau))
         offsets = [abs(np.median(drift.residuals[sector == number])) for number in np.unique(sector)]
         residual_px = float(np.median(offsets)) * cylinder.focal_px
@@ -209,7 +208,7 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
         state = RigState.UNCHECKED
     elif misfit_deg > DRIFTED_DEG or residual_px > DRIFTED_PX:
         state = RigState.DRIFTED
-    return RigFinding(state, len(lower), sum(one.tried for one in found), drift, residual_px)
+    return RigFinding(state, len(lower), sum(one.tried for one in found), drift)
 
 
 class RigHealth:

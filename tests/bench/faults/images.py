@@ -25,7 +25,7 @@ from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.robot import make_robot
 from tests.bench.obstacles import ahead
 from tests.bench.results import ResultTable, columns
-from tests.simulation.disturbed import Fault, Tamper, simulate
+from tests.simulation.disturbed import Fault, Tamper, least_clearance_m, simulate
 from tests.simulation.hazard_worlds import trial
 
 Image = NDArray[np.uint8]
@@ -180,7 +180,7 @@ def run(name: str, seed: int, overrides: tuple[str, ...] = ()) -> Outcome:
     rest_s = next((at_s for at_s, speed in speeds.items() if at_s > moving_s and speed < REST_MPS), math.nan)
     began_s = max(case.since_s, moving_s)
     return Outcome(
-        contact_mps, done.clearance_m, first[0] - began_s if first[1] else math.nan, first[1], rest_s - began_s
+        contact_mps, least_clearance_m(done), first[0] - began_s if first[1] else math.nan, first[1], rest_s - began_s
     )
 
 

@@ -121,7 +121,7 @@ def test_views_of_one_camera_are_used_and_exchanged_cameras_are_a_warning(
     assert "4 pairs, 2 views of one camera alone; drives: scale uncertain by " in output.out
     assert "exchange their images, unless the cameras look down into their mirrors" in output.err
     assert found.covariance is not None and "upper a2" in found.covariance.names
-    assert abs(found.baseline_m - TRUTH.baseline_m) < 4 * found.covariance.sigma("baseline") < 8e-3
+    assert abs(found.baseline_m - TRUTH.baseline_m) < 4 * found.covariance.select(["baseline"]).sigmas[0] < 8e-3
 
 
 def test_images_without_a_board_are_one_line_and_exit_code_2(

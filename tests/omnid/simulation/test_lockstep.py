@@ -37,7 +37,7 @@ from tests.bench.obstacles import ahead
 from tests.busy import stopped_by_turns
 from tests.ports import free_port
 from tests.replay.live import started
-from tests.simulation.disturbed import Fault, Tamper, simulate
+from tests.simulation.disturbed import Fault, Tamper, least_clearance_m, simulate
 from tests.waiting import wait_until
 
 SIZE = 160
@@ -82,7 +82,7 @@ def test_the_robot_follows_its_setpoint_and_estimates_its_own_motion(run: Simula
     assert 0.2 < truth[0, 3] < 0.6 and 0.02 < float(se3.yaw(truth)) < 0.2
     np.testing.assert_allclose(estimate[:2, 3], truth[:2, 3], atol=0.03)
     assert float(se3.yaw(estimate)) == pytest.approx(float(se3.yaw(truth)), abs=math.radians(1.5))
-    assert run.contacts == [] and run.clearance_m > 0.3
+    assert run.contacts == [] and least_clearance_m(run) > 0.3
 
 
 def test_a_motor_that_is_cut_off_stops_by_its_own_watchdog() -> None:
