@@ -123,7 +123,7 @@ def parse_rig(text: str | bytes, name: str = "rig.toml") -> Rig:
     """Parse the rig of a `rig.toml`'s text."""
     with within(f"{name}: "):
         values = table_of(text.encode() if isinstance(text, str) else text)
-        _require_version("schema", values.get("schema"), SCHEMA)  # first, as another one has other keys
+        _require_version("schema", values.get("schema"))  # first, as another one has other keys
         table = convert(RigTable, values)
         lower, upper = (_mounted(side, getattr(table, side)) for side in SIDES)
         return Rig(
@@ -136,9 +136,9 @@ def parse_rig(text: str | bytes, name: str = "rig.toml") -> Rig:
         )
 
 
-def _require_version(key: str, found: object, version: int) -> None:
-    if type(found) is not int or found != version:
-        raise CalibError(f"{key}: expected version {version}, found {'nothing' if found is None else shown(found)}")
+def _require_version(key: str, found: object) -> None:
+    if type(found) is not int or found != SCHEMA:
+        raise CalibError(f"{key}: expected version {SCHEMA}, found {'nothing' if found is None else shown(found)}")
 
 
 def _mounted(side: str, table: CameraTable) -> MountedCamera:
@@ -199,7 +199,7 @@ def _mask_image(source: str, size: Size) -> NDArray[np.uint8]:
 
 def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
     """Return the covariance of the parameters of both cameras and of the transform between them."""
-    _require_version("covariance.version", table.version, SCHEMA)
+    _require_version("covariance.version", table.version)
     known, names = {*TRANSFORM_NAMES}, table.parameters
     for side, camera in (("lower", rig.lower), ("upper", rig.upper)):
         known |= {f"{side} {name}" for name in names_of(camera.model)}

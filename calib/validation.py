@@ -26,10 +26,10 @@ MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memor
 Warn: TypeAlias = Callable[[str], None]
 
 
-def read_bytes(path: str | PathLike[str], limit: int = MAX_FILE_BYTES) -> bytes:
-    """Read a calibration file of at most limit bytes."""
+def read_bytes(path: str | PathLike[str]) -> bytes:
+    """Read a calibration file of at most MAX_FILE_BYTES."""
     with within(f"{path}: "):
-        return bytes_of(path, limit)
+        return bytes_of(path, MAX_FILE_BYTES)
 
 
 def read_text(path: str | PathLike[str]) -> str:

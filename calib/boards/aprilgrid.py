@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from calib.boards.board import TAG_BORDER_BITS, AprilGrid, BoardView
-from calib.boards.corner_candidates import BLUR_PX, Grey, Image, smoothed
+from calib.boards.corner_candidates import Grey, Image, smoothed
 from calib.boards.corner_grid import shown_corners
 from calib.boards.local_mapping import REACH, local_mapping, refined_corners, without_outliers
 from calib.models.camera import Array
@@ -38,7 +38,7 @@ def find_april_grid(image: Image, board: AprilGrid, name: str = "") -> BoardView
         return None
     points = board.points[:, :2] / board.tag_m
     places, outlines = corners[list(tags)].reshape(-1, 2), np.concatenate(list(tags.values()))
-    pixels = _grown(smoothed(image, BLUR_PX), points, places, outlines, board.window)
+    pixels = _grown(smoothed(image), points, places, outlines, board.window)
     # Corners in one line have no mapping, and those of tags that are misread, or of another grid, do not fit to it.
     pixels = without_outliers(points, refined_corners(image, points, pixels, board.window))
     return BoardView(name, pixels) if np.isfinite(pixels[:, 0]).sum() >= MIN_CORNERS else None

@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.boards.board import Board, BoardView
 from calib.boards.corner_candidates import (
-    BLUR_PX,
     Grey,
     Image,
     find_corners,
@@ -35,7 +34,7 @@ MIN_FILLED = 0.6
 
 def find_board(image: Image, board: Board, name: str = "") -> BoardView | None:
     """Find the board in an image (H, W) uint8, its corners refined to a fraction of a pixel; None if there is none."""
-    blurred, points = smoothed(image, BLUR_PX), board.points[:, :2] / board.square_m
+    blurred, points = smoothed(image), board.points[:, :2] / board.square_m
     for grid in _grids(image, board):
         # 1. Grow the grid by corners of the image itself.
         placed = _fullest_window(grow_grid(blurred, grid, _most_corners(board)), board)
@@ -93,7 +92,7 @@ def _square_means(image: Grey, corners: Array, board: Board) -> Array:
 
 def _grids(image: Image, board: Board) -> list[Grid]:
     """Return the grids of linked corners, those nearest to the board's size first."""
-    grids, size = find_grids(smoothed(image, BLUR_PX), find_corners(image)), board.columns * board.rows
+    grids, size = find_grids(smoothed(image), find_corners(image)), board.columns * board.rows
     return [with_clockwise_axes(grid) for grid in sorted(grids, key=lambda grid: abs(np.log(len(grid) / size)))]
 
 

@@ -82,14 +82,14 @@ def sample(image: Grey, pixels: Array) -> Array:
     return np.asarray(values.ravel()[: len(flat)].reshape(pixels.shape[:-1]), float)
 
 
-def smoothed(image: NDArray[np.generic], blur_px: float) -> Grey:
+def smoothed(image: NDArray[np.generic]) -> Grey:
     """Return the image (H, W) as float32 after a Gaussian blur."""
-    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), blur_px), np.float32)
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX), np.float32)
 
 
 def _at_scale(image: NDArray[np.uint8], scale: float) -> CornerCandidates:
     """Return the corners at one scale, in pixels of the image itself."""
-    blurred = smoothed(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), BLUR_PX)
+    blurred = smoothed(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
     found = describe_corners(blurred, _saddles(blurred, math.ceil(RING_PX)), RING_PX)
     found = found.select(found.quality > 0)
     return replace(found, pixels=(found.pixels + 0.5) / scale - 0.5, ring_px=found.ring_px / scale)

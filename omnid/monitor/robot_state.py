@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import closing, nullcontext
-from typing import IO, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -180,9 +180,9 @@ def listen(bus: BusConfig, seconds: float | None) -> int:
     return int(state.poses == 0)
 
 
-def print_state(robot: str, state: RobotState, out: IO[str] | None = None) -> None:
+def print_state(robot: str, state: RobotState) -> None:
     """Write a table in place on a terminal, as far as it fits, else one line."""
-    out = out or sys.stdout
+    out = sys.stdout
     if out.isatty():
         size = shutil.get_terminal_size()
         lines = [line[: size.columns] for line in status_table(robot, state)]
@@ -242,13 +242,13 @@ def reports_of(robot: Robot, command_ns: int) -> Iterator[NavigationReport]:
     )
 
 
-def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = None) -> bool:
-    """Repeat a stop until the robot's status confirms it; False if it has not within answer_s.
+def stop(bus: BusConfig, connection: Robot | None = None) -> bool:
+    """Repeat a stop until the robot's status confirms it; False if it has not within ANSWER_S.
 
     A datagram is tried first, because it needs no session of the bus. If the robot does not answer it, the stop goes
     over the bus: by the given connection, else by a new one. Raise OmnidError where the robot cannot be reached.
     """
-    deadline_s = time.monotonic() + answer_s
+    deadline_s = time.monotonic() + ANSWER_S
     with closing(StopSender(bus.robot, bus.connect or (HERE,))) as datagrams:
         if datagrams.ask(REPEAT_S):
             return datagrams.ask(deadline_s - time.monotonic()) == STOPPED

@@ -350,4 +350,4 @@ def _box(rng: Random, entry: Box) -> list[Rectangle]:
 
 
 def _person(rng: Random, walk: Walker) -> Person:
-    return Person(tuple(surfaces.box(rng, (0.0, 0.0), walk.size_m, 0.0)), walk)
+    return Person(tuple(_box(rng, Box((0.0, 0.0), walk.size_m))), walk)

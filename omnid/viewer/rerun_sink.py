@@ -105,7 +105,7 @@ class RerunSink:
                 self._status(content)
             case Cloud() if self.wants("cloud"):
                 points = content.points[np.isfinite(content.points).all(axis=1)]
-                self._at(content.stamp_ns).log("odom/map", _points_3d(points, MAP_POINTS, THIN))
+                self._at(content.stamp_ns).log("odom/map", _points_3d(points, MAP_POINTS))
             case Scan() if self.wants("scan"):
                 self._scan(content)
             case Frame() if self.wants("image"):
@@ -138,7 +138,7 @@ class RerunSink:
         image = rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0, depth_range=(0.0, far_mm))
         stream = self._at(stamp_ns)
         stream.log("depth", image)
-        stream.log("odom/base_link/points", _points_3d(points, RIG_POINTS, THIN))
+        stream.log("odom/base_link/points", _points_3d(points, RIG_POINTS))
 
     def close(self) -> None:
         """Flush and end the drawing; a second call does nothing."""
@@ -269,10 +269,10 @@ def _px(size: float) -> Any:
     return rr.components.Radius.ui_points(size)
 
 
-def _points_3d(points: NDArray[Any], most: int, size_px: float) -> Any:
+def _points_3d(points: NDArray[Any], most: int) -> Any:
     """Return points (N, 3), evenly chosen, dark below and light above, between percentiles of the heights."""
     points = points[:: max(1, -(-len(points) // most))]
     low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
     share = np.clip((points[:, 2] - low) / max(1e-3, high - low), 0, 1)
     colours = cv2.applyColorMap((255 * share).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)
-    return rr.Points3D(points, colors=colours.reshape(-1, 3)[:, ::-1], radii=_px(size_px))
+    return rr.Points3D(points, colors=colours.reshape(-1, 3)[:, ::-1], radii=_px(THIN))

@@ -1,8 +1,8 @@
 """Rendered worlds with exact ground truth: scenes, rigs, paths, and logs of a robot in them."""
 
 from omnid.simulation.rendering.ray_caster import Sensor, render_grey
-from omnid.simulation.rendering.surfaces import Rectangle, Scene, box, posters
-from tests.simulation.builders import corridor, room, wall
+from omnid.simulation.rendering.surfaces import Rectangle, Scene, posters
+from tests.simulation.builders import box, corridor, room, wall
 from tests.simulation.logs import render, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build
 from tests.simulation.rigs import make_rig

@@ -16,14 +16,20 @@ from omnid.simulation.rendering.surfaces import (
     Random,
     Rectangle,
     Scene,
-    box,
     painted,
+    poster_paint,
     posters,
+    solid,
 )
 from tests.simulation.paths import planar_poses
 
 # Number of worlds of each kind that are kept, as many tests show the same; their textures are a few megabytes each.
 KEPT = 6
+
+
+def box(rng: Random, centre: Point, size_m: tuple[float, float, float], yaw_rad: float) -> list[Rectangle]:
+    """Return a box on the floor: four sides and the top, each with a texture of its own."""
+    return solid((*centre, 0.0), size_m, yaw_rad, poster_paint(rng), is_raised=False)
 
 
 def wall(rng: Random, kind: str, left: Point, right: Point) -> Rectangle:

@@ -255,11 +255,6 @@ def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rect
     return hung
 
 
-def box(rng: Random, centre: Point, size_m: tuple[float, float, float], yaw_rad: float) -> list[Rectangle]:
-    """Return a box on the floor: four sides and the top, each with a texture of its own."""
-    return solid((*centre, 0.0), size_m, yaw_rad, poster_paint(rng), is_raised=False)
-
-
 def solid(
     at: tuple[float, float, float],
     size_m: tuple[float, float, float],

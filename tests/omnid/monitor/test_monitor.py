@@ -128,8 +128,8 @@ def test_the_table_holds_no_control_characters_of_messages() -> None:
     state = received(1, 2)
     evil = [DiagnosticStatus(WHEELS, 2, "\x1b[2J\nhello", {"sent": "4"}), DiagnosticStatus(BUS, 0, "", {})]
     state.process(ReceivedMessage("status", codec.diagnostics_cdr(1, evil), b"", 0.0))
-    terminal = Terminal()
-    print_state("omnid", state, terminal)
+    with contextlib.redirect_stdout(Terminal()) as terminal:
+        print_state("omnid", state)
     shown = terminal.getvalue()
     assert shown.count("\x1b[") == 2 and "wheels" in shown and "hello" in shown
     assert len(shown.splitlines()) == 6 and "1 sigma 1.0 mm" in shown
