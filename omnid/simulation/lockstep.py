@@ -53,8 +53,8 @@ class Moment:
     place: PlaceUpdate | None  # newest pose in the map
 
 
-# A setpoint of the operator, a request to arm, a stop, the end of the run, or a request to the navigation.
-Request: TypeAlias = Setpoint | Literal["arm", "stop", "end"] | NavigationRequest
+# A setpoint of the operator, a request to arm, the end of the run, or a request to the navigation.
+Request: TypeAlias = Setpoint | Literal["arm", "end"] | NavigationRequest
 # Sends requests as a person or a program would; called once for every pair of images.
 Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
 
@@ -161,8 +161,6 @@ def simulate(
                 body.post(TimedSetpoint(arrival_ns, request))
             elif request == "arm":
                 body.post(ArmRequest(arrival_ns))
-            elif request == "stop":
-                body.post("stop")
             elif request == "end":
                 ends = True
             else:

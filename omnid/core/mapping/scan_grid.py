@@ -61,7 +61,6 @@ class KeyframeScans:
     scans: Mapping[int, NDArray[np.float16]]  # (360,) each, see range_scan.py
     free_m: Mapping[int, NDArray[np.float16]]  # (360,) each, up to which floor was seen, see FreeRanges
     T_map_rect: Array
-    loops: tuple[tuple[int, int], ...] = ()  # ids of the keyframes between which places were recognised
 
 
 class KeyframeGrid:

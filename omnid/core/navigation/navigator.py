@@ -65,7 +65,6 @@ class Detour(NamedTuple):
 class Drive:
     """A drive from its start to its end."""
 
-    task: str  # description in words
     frame: NavigationFrame
     paths: list[DrivePath]  # paths that are driven one after the other
     follower: Follower  # of the first of them
@@ -212,9 +211,7 @@ class Navigator:
     ) -> None:
         """Begin a drive, which replaces the one before."""
         follower, pose = Follower(paths[0], self.settings), now.pose
-        self.drive = Drive(
-            task, frame, paths, follower, now.resets, now.wheels.stop_count, float(pose[2]), pose[:2].copy()
-        )
+        self.drive = Drive(frame, paths, follower, now.resets, now.wheels.stop_count, float(pose[2]), pose[:2].copy())
         self.task, self.command_ns, self._stops = task, command_ns, 0
         self.state, self.reason = NavigationState.DRIVING, ""
 

@@ -199,7 +199,6 @@ class MapLocaliser:
                 {keyframe.id: keyframe.scan for keyframe in shown},
                 {keyframe.id: keyframe.free_m for keyframe in shown},
                 np.array([self.places.poses[id] for id in ids]).reshape(-1, 4, 4),
-                tuple((link.a, link.b) for link in self.places.links if link.is_loop),
             )
         return self._scans
 
