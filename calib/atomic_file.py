@@ -13,8 +13,6 @@ from glob import escape
 from pathlib import Path
 from typing import Final
 
-from calib.errors import CalibError
-
 # The temporary file is new, and not a link that another program has made.
 _NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
@@ -23,8 +21,12 @@ _NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXE
 def replacement(path: Path) -> Iterator[Path]:
     """Yield an empty temporary file, which takes the place of the file at the end of the block, not after an error.
 
-    Temporary files that killed programs have left for this file are removed. Raises OSError.
+    A pipe or a device is no file to replace: it is yielded itself. Temporary files that killed programs have left for
+    this file are removed. Raises OSError.
     """
+    if path.exists() and not path.is_file():
+        yield path
+        return
     target = Path(os.path.realpath(path))
     for part in target.parent.glob(f".{escape(target.name)}.*.part"):
         process = part.name.split(".")[-2]
@@ -41,18 +43,6 @@ def replacement(path: Path) -> Iterator[Path]:
         _sync(target.parent)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole; a pipe or a device is written directly. Raises CalibError if that is impossible."""
-    try:
-        if path.exists() and not path.is_file():
-            path.write_bytes(data)
-            return
-        with replacement(path) as partial:
-            partial.write_bytes(data)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise CalibError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
 
 
 def _sync(path: Path) -> None:

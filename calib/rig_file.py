@@ -21,7 +21,7 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.atomic_file import write_file
+from calib.atomic_file import replacement
 from calib.errors import CalibError, within
 from calib.models.camera import Mask, OmniCamera
 from calib.models.names import MODELS, camera_of, is_coefficient, model_name, names_of, values_of
@@ -223,8 +223,12 @@ def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
 
 # 3. Writing.
 def write_rig(path: Path, rig: Rig) -> None:
-    """Write `rig.toml`, with the images of masks within it."""
-    write_file(path, rig_toml(rig).encode())
+    """Write `rig.toml`, with the images of masks within it. Raises CalibError if that is impossible."""
+    try:
+        with replacement(path) as partial:
+            partial.write_text(rig_toml(rig), "utf-8")
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise CalibError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
 
 
 def png(image: NDArray[np.uint8]) -> bytes:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.atomic_file import write_file
 from calib.boards.board import AnyBoard, AprilGrid, Board, BoardView
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.rig_uncertainty import drive_uncertainty
@@ -29,6 +28,7 @@ from omnid.calibration.board_search import (
 from omnid.calibration.images import PairedImages, brightest, read_pairs
 from omnid.calibration.rig_report import angle_lines, angle_rows, rig_report_html
 from omnid.errors import OmnidError
+from omnid.formats.exports import write_whole
 
 # Relative difference from the baseline by ruler that is no error of a ruler.
 REFUSED_PART = 0.1
@@ -69,8 +69,8 @@ class RigResult:
         write_rig(Path(path), self.rig)
 
     def save_report(self, path: str | PathLike[str]) -> None:
-        """Write an HTML page with residuals and coverage."""
-        write_file(Path(path), rig_report_html(self.calibration, self.images).encode())
+        """Write an HTML page with residuals and coverage. Raises OmnidError if that is impossible."""
+        write_whole(Path(path), rig_report_html(self.calibration, self.images).encode())
 
 
 def calibrate_rig(

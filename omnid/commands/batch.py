@@ -24,10 +24,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from calib.atomic_file import write_file
 from omnid.commands.options import CAMERAS, FILE_AND_SET, command, require, settings_of
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
+from omnid.formats.exports import write_whole
 from omnid.plain_text import one_line, plain
 from omnid.version import __version__
 
@@ -102,7 +102,7 @@ def replay(job: Job) -> dict[str, Any]:
     if code in DONE and job.truth is not None:
         result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
     result["seconds"] = round(time.monotonic() - started_s, 3)
-    write_file(job.folder / RESULT_FILE, json.dumps(result, indent=1).encode() + b"\n")
+    write_whole(job.folder / RESULT_FILE, json.dumps(result, indent=1).encode() + b"\n")
     return result
 
 

@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from calib import se3
-from calib.atomic_file import write_file
 from calib.boards.board import AnyBoard, AprilGrid, Board
 from calib.importers import import_pair, parse_chain, stacked_rig, straight_up
 from calib.models.names import model_in_words
@@ -33,6 +32,7 @@ from omnid.core.rig.rig_health import RigState
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError
+from omnid.formats.exports import write_whole
 from omnid.runs.wiring import attached_rig
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus import Bus
@@ -149,7 +149,7 @@ def live(args: argparse.Namespace) -> int:
                 if outcome == "kept":
                     number += 1
                     for side, image in zip(SIDES, pair, strict=True):
-                        write_file(folder / f"{side}_{number:03d}.png", png(image))
+                        write_whole(folder / f"{side}_{number:03d}.png", png(image))
                 HANDLER.show(f"{boards.pairs} ({outcome}): {missing}")
                 if time.monotonic() >= published_s + config.live.status_s:
                     published_s = time.monotonic()

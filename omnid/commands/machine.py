@@ -12,7 +12,6 @@ from contextlib import closing
 from itertools import chain, islice
 from pathlib import Path
 
-from calib.atomic_file import write_file
 from calib.rig_file import png
 from drivers.cameras.v4l2_camera import V4l2Camera
 from drivers.cameras.v4l2_device import V4l2Settings, capture_devices
@@ -26,6 +25,7 @@ from omnid.config import FIRST_SETTINGS
 from omnid.doctor import checks
 from omnid.doctor.wheel_wiring import tested_drive
 from omnid.errors import OmnidError
+from omnid.formats.exports import write_whole
 from omnid.light.exposure import USUAL_HZ
 from omnid.monitor.robot_state import listen as listen_to
 from omnid.service import install
@@ -164,7 +164,7 @@ def _snapshot(args: argparse.Namespace) -> int:
             raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
         view = snapshot.view_of(found)
         path = args.snapshot / f"{camera}.png"
-        write_file(path, png(snapshot.annotated(view)))
+        write_whole(path, png(snapshot.annotated(view)))
         print(f"{path}: {snapshot.described(view)}")
     return 0
 

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calib import se3
-from calib.atomic_file import write_file
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.logs.log import Log
 from drivers.logs.log_reader import open_log
@@ -27,6 +26,7 @@ from omnid.commands import options
 from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
+from omnid.formats.exports import write_whole
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import plain, utc
@@ -246,6 +246,6 @@ def report(args: argparse.Namespace) -> int:
     truth = read_tum(args.truth) if args.truth else None
     recorded = RecordedRun(args.log, args.topic)
     html = report_html(recorded, truth)
-    write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
+    write_whole(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
     print(plain(f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"))
     return 0

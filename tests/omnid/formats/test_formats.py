@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from calib import se3
-from calib.atomic_file import write_file
+from calib.rig_file import write_rig
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED, UNKNOWN, Grid
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_grid, write_ply, write_whole
-from omnid.formats.place_file import read_places, write_places
+from omnid.formats.place_file import write_places
 from omnid.formats.plan import drawn_heights, plan_view
 from omnid.formats.tum import read_tum, tum_row
 from tests.omnid.formats.place_maps import RIG, some_places
 from tests.ply import read_ply
+from tests.simulation import make_rig
 
 GOOD = "1700000000.099999905 1 2 3 0 0 0 1\n"
 
@@ -207,7 +208,11 @@ def write_map(path: Path, content: bytes) -> None:
     write_places(path, some_places(2), RIG)
 
 
-WRITERS = pytest.mark.parametrize("write", [write_whole, write_map, write_file])
+def write_rig_file(path: Path, content: bytes) -> None:
+    write_rig(path, make_rig())
+
+
+WRITERS = pytest.mark.parametrize("write", [write_whole, write_map, write_rig_file])
 
 
 @WRITERS
@@ -222,7 +227,7 @@ def test_a_file_is_written_where_its_link_leads(
     link.symlink_to(file)
     write(link, b"new")
     assert link.is_symlink() and os.listdir(tmp_path / "disk") == ["file"]
-    assert len(read_places(file)[0]) == 2 if write is write_map else file.read_bytes() == b"new"
+    assert file.read_bytes() == b"new" if write is write_whole else file.read_bytes() not in (b"", b"old")
 
 
 @WRITERS
@@ -234,3 +239,13 @@ def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(
     (tmp_path / f".file.{os.getpid()}.part").symlink_to(victim)
     write(path, b"new")
     assert victim.read_bytes() == b"mine" and path.is_file() and not path.is_symlink()
+
+
+@pytest.mark.parametrize("write", [write_whole, write_rig_file])
+def test_a_pipe_is_written_and_not_replaced(tmp_path: Path, write: Callable[[Path, bytes], None]) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with open(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), "rb") as reader:
+        write(pipe, b"new")
+        assert reader.read()
+    assert os.listdir(tmp_path) == ["pipe"] and pipe.is_fifo()
