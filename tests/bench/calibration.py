@@ -44,10 +44,10 @@ from omnid.simulation.rendering.ray_caster import Sensor
 from tests.bench.results import ResultTable, columns, run
 from tests.simulation import corridor, paths
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
+from tests.simulation.disturbances import jpeg
 from tests.simulation.logs import write_log
 from tests.simulation.recipes import build, mild_rig
 from tests.simulation.rigs import with_real_mirrors
-from tests.simulation.sensors import jpeg
 
 FAMILY = "rigs of boards"
 BOARD = Board(9, 6, 0.05)

@@ -22,8 +22,8 @@ from omnid.simulation.rendering.ray_caster import Sensor
 from tests.omnid.stages.test_obstacles import scans_of
 from tests.replay.command import Command
 from tests.simulation import build, corridor, paths, render_grey, tum, write_log
+from tests.simulation.disturbances import MountedSensor
 from tests.simulation.rigs import lens, lens_rig
-from tests.simulation.sensors import MountedSensor
 
 SIZE, PAIRS, SEEN_DEG = 256, 16, 115.0
 FOOTPRINT_M = 0.3  # of the robot, on which nothing else can be: 7 cells of 5 cm square, to the next cell

@@ -3,10 +3,10 @@
 from omnid.simulation.rendering.ray_caster import Sensor, render_grey
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, posters
 from tests.simulation.builders import box, corridor, room, wall
+from tests.simulation.disturbances import MountedSensor
 from tests.simulation.logs import render, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build
 from tests.simulation.rigs import make_rig
-from tests.simulation.sensors import MountedSensor
 
 __all__ = [
     "RECIPES",

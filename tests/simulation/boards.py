@@ -15,8 +15,8 @@ from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
 from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, value_noise
-from tests.simulation.real_cameras import render_real
-from tests.simulation.sensors import MountedSensor
+from tests.simulation.disturbances import MountedSensor
+from tests.simulation.rigs import render_real
 
 # Side of a square in the board's texture.
 SQUARE_PX = 24

@@ -25,8 +25,7 @@ from omnid.simulation.rendering.ray_caster import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedCameras, SimulatedRobot, Vehicle
 from omnid.simulation.world import Walkers, World
-from tests.simulation.disturbances import Mirror, seen_part
-from tests.simulation.sensors import MountedSensor, jpeg
+from tests.simulation.disturbances import Mirror, MountedSensor, jpeg, seen_part
 
 HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor
 WHEEL_M: Final = 0.05  # A wheel rounds off the heights within this distance.

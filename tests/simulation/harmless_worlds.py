@@ -34,8 +34,8 @@ from tests.simulation.building_parts import (
     put_thing,
     trolley,
 )
+from tests.simulation.disturbances import FlawedSensor
 from tests.simulation.disturbed import BuildingWorld, Ground, SunPatch, disturbed
-from tests.simulation.sensors import FlawedSensor
 
 # Names of floors, with the kinds of their textures.
 FLOORS: Final = {

@@ -18,10 +18,8 @@ from calib.rig_file import write_rig
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.simulation.rendering.ray_caster import Floats, Sensor
 from omnid.simulation.rendering.surfaces import Scene
-from tests.simulation.disturbances import Disturbance, DisturbedCamera
-from tests.simulation.real_cameras import render_real
-from tests.simulation.rigs import MirrorCamera, nominal_rig
-from tests.simulation.sensors import MountedSensor, jpeg
+from tests.simulation.disturbances import Disturbance, DisturbedCamera, MountedSensor, jpeg
+from tests.simulation.rigs import MirrorCamera, nominal_rig, render_real
 
 
 def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:

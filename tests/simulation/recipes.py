@@ -14,8 +14,8 @@ from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation import paths
 from tests.simulation.builders import KEPT, bricks, corridor, ring, room, symmetric_room, twin_corridor, two_laps_path
+from tests.simulation.disturbances import FlawedSensor
 from tests.simulation.rigs import make_rig
-from tests.simulation.sensors import FlawedSensor
 
 TURN_DEG = 94.0
 # Mean grey of about 30 of 255; the brightness of each image differs by 20 %.

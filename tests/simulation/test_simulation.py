@@ -15,8 +15,7 @@ from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.world import clearance_m
 from tests.simulation import build, corridor, render, write_log
 from tests.simulation.hazard_worlds import HAZARDS, trial
-from tests.simulation.real_cameras import render_real
-from tests.simulation.rigs import MirrorCamera, with_real_mirrors
+from tests.simulation.rigs import MirrorCamera, render_real, with_real_mirrors
 
 SIZE = 96
 

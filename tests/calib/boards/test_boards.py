@@ -27,7 +27,7 @@ from tests.simulation.boards import (
     print_of,
     render_april_grid,
 )
-from tests.simulation.sensors import FlawedSensor
+from tests.simulation.disturbances import FlawedSensor
 
 BOARD = Board(6, 5, 0.03)
 CAMERA = UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480))
