@@ -54,6 +54,11 @@ class CollisionSettings:
         "says, s",
     ] = 0.5
 
+    @property
+    def outline(self) -> Outline:
+        """Outline of the base."""
+        return Outline(self.front_m, self.rear_m, self.half_width_m)
+
 
 class MovingPoint(NamedTuple):
     """A moving obstacle in the base frame of its scan, whose axes do not move; m, m/s."""
@@ -255,7 +260,7 @@ class CollisionMonitor:
         """braking_mps2, turn_braking_radps2: with which the base can brake its speed and its turn."""
         self._settings = settings
         self._deceleration, self._turn_deceleration = BRAKING_SHARE * braking_mps2, BRAKING_SHARE * turn_braking_radps2
-        self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
+        self._outline = settings.outline
         # Room for turns where the images show nothing.
         self._around = self._outline.grown(settings.stop_m, settings.stop_m, settings.side_m + BESIDE_M)
         self._stamp_ns: int | None = None
@@ -383,10 +388,10 @@ class CollisionMonitor:
         elif kind.reason == UNOBSERVED:
             return FREE
         else:
-            # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
-            # would keep the base from turning away.
+            # Corners may swing as far as floor was seen. An unknown region that begins within two cells of the outline
+            # does not count: it would keep the base from turning away.
             stop = self._stop_polygon(motion)
-            points = [point for point in points if stop.depth_m(*point) > 0.0]
+            points = [point for point in points if stop.depth_m(*point) > 2 * BESIDE_M]
             speed_mps = abs(motion.yaw_rate_radps) * outline.radius_m
         least = 0.0 if kind.policy == STOP else min(1.0, settings.slow_mps / speed_mps)
         share = max(self._share_before(points, motion, ALONG_SLOPE), least)

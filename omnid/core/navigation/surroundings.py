@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.control.collision_monitor import CollisionSettings, Outline, unknown_ends
+from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
 from omnid.core.obstacles.grid import CELL_M, OCCUPIED, SQUARE, UNKNOWN, FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 
@@ -153,7 +153,7 @@ def near_ends(pose: Array, ranges_m: Ranges, free_m: Ranges, collision: Collisio
     ranges_m, free_m (S,): of a scan from there. collision: the outline, in which nothing ends, and the distance within
     which an end belongs to a surface, in any direction: along a wall, no ray shows floor up to it.
     """
-    outline = Outline(collision.front_m, collision.rear_m, collision.half_width_m)
+    outline = collision.outline
     ends = unknown_ends(ranges_m.tolist(), free_m.tolist(), collision.stop_m)
     azimuths = (np.arange(len(ranges_m)) + 0.5) * (math.tau / len(ranges_m)) - math.pi
     directions = np.column_stack([np.cos(azimuths + pose[2]), np.sin(azimuths + pose[2])])
