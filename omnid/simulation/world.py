@@ -101,7 +101,8 @@ def moved(face: Rectangle, place: tuple[float, float, float]) -> Rectangle:
     return replace(face, origin=R @ face.origin + (x_m, y_m, 0.0), edge_u=R @ face.edge_u, edge_v=R @ face.edge_v)
 
 
-FLOOR_M = 0.02  # Objects that are lower than this are driven over.
+CLIMBED_M = 0.035  # Objects that are lower than this are driven over: steps of 2 and 3 cm, cables, plates.
+FLAT_M = 0.01  # Rectangles that rise by less are horizontal.
 
 
 @dataclass(frozen=True)
@@ -133,14 +134,14 @@ class World:
     def footprints(self, rectangles: Sequence[Rectangle], height_m: float) -> Array:
         """Return the segments (N, 2, 2) [m] on the floor of all that reaches below a height, other than the floor.
 
-        Rectangles named "floor" are never met. Boxes and walls are closed by upright rectangles, so that their outlines
-        are enough.
+        Rectangles named "floor" are never met, nor is what is driven over. Boxes and walls are closed by upright
+        rectangles, so that their outlines are enough.
         """
         segments = []
         for rectangle in rectangles:
             corners = rectangle.corners
             low_m, high_m = corners[:, 2].min(), corners[:, 2].max()
-            if rectangle.name != "floor" and high_m - low_m > FLOOR_M and low_m < height_m and high_m > FLOOR_M:
+            if rectangle.name != "floor" and high_m - low_m > FLAT_M and low_m < height_m and high_m > CLIMBED_M:
                 spread = corners[:, :2] - corners[0, :2]
                 far = int(np.argmax((spread**2).sum(axis=1)))
                 other = int(np.argmax(((corners[:, :2] - corners[far, :2]) ** 2).sum(axis=1)))

@@ -24,7 +24,7 @@ class ScanSettings:
     heights_m: Annotated[
         tuple[Annotated[float, Meta(ge=-10, le=10)], Annotated[float, Meta(ge=-10, le=10)]],
         "heights above the floor between which a surface is an "
-        "obstacle, of the scan and of the map, m: lower ones are floor, higher ones "
+        "obstacle, of the scan and of the map, m: lower ones are driven over, higher ones "
         "are passed below",
     ] = (0.06, 1.7)
     # sigma of the tilt of the base against the floor: in the map the margin above the floor grows with the range
