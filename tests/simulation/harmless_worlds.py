@@ -111,6 +111,12 @@ def _floor(b: Builder, *, in_hall: bool = False) -> Trial:
     return Trial(built(b))
 
 
+def _narrow(b: Builder) -> Trial:
+    """A corridor whose walls are nearer than the floor in view."""
+    corridor(b, width_m=b.rng.uniform(1.2, 1.4))
+    return Trial(built(b))
+
+
 def _polished_corridor(b: Builder) -> Trial:
     """Windows in one wall, which the floor mirrors."""
     b.space((-BEHIND_M, -0.9), (12.0, 0.9), doors=3, windows=5)
@@ -283,6 +289,7 @@ MAKERS: Final[Makers] = {
     **{name: (kind, _floor) for name, kind in FLOORS.items() if name != "polished"},
     "polished": ("slabs", _polished_corridor),
     **{f"{name}_hall": (kind, partial(_floor, in_hall=True)) for name, kind in FLOORS.items()},
+    "narrow": (None, _narrow),
     r"ramp_(\d+)": (None, _ramp),
     "lift_gap": (None, _lift_gap),
     "sun_moving": (None, _sun_moving),
@@ -300,6 +307,6 @@ NAMES: Final = (
     *FLOORS,
     *(f"{name}_hall" for name in FLOORS),
     *("ramp_2", "ramp_5", "ramp_8", "lift_gap", "sun_moving", "light_switch", "dark_and_on"),
-    *("trolley_leaves", "person_passes"),
+    *("trolley_leaves", "person_passes", "narrow"),
     *("door_80", "door_80_aslant", "office", "clutter", "dead_end_and_back", "doorway_with_person"),  # to a goal
 )

@@ -54,6 +54,11 @@ class GridParameters:
     person_cells: int = 5  # width of who may
     strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
+    wall_rad: float = 0.5  # least half of the angle that a wall hides which is too near to be seen
+    wall_gap: int = 27  # directions of it in which floor seems to be in view,
+    wall_end: int = 16  # and beside its ends, where it is in view
+    wall_m: float = 0.2  # by which its foot is farther there than expected, at most
+    wall_nats: float = 2.0  # log-odds of a wall that is assumed
     arrival_nats: float = 2.0  # by which one pair shows a thing that has come [nats]
     lately_s: float = 3.0  # for how long it counts that a cell was free
     arrival_m: float = 0.2  # least width of what has come,
@@ -204,6 +209,7 @@ class ObstacleGrid:
         self._known[observed | (past & (self._past_views >= p.views))] = 1
         if is_first:
             self._assume_free(columns, hides, belief)
+            self._assume_walls(yaw, hides, belief)
         # 4. What hides the nearest floor in view, behind which floor was seen before, may be anywhere before it. What
         #    hides it from the start may be where it was. And somebody may come where no pair shows the floor.
         rays = _along(self._eye, yaw)
@@ -322,6 +328,37 @@ class ObstacleGrid:
         free = self._ranges_m < reach_m[np.floor(columns + 0.5).astype(np.intp) % count]
         self._known[free], self._past_views[free] = 1, p.views
         self.odds[free & (self.odds < 0)] = p.least
+
+    def _assume_walls(self, yaw_rad: float, hides: Flags, belief: RayBelief) -> None:
+        """Take what hides the nearest floor in view at the start for a wall, where a straight one goes on at both ends.
+
+        So a base may begin between walls that are nearer than the floor in view. Beside what stands alone the floor
+        goes on, and what ends it there is too far away to hide any. hides (D,).
+        """
+        p, count = self._p, len(hides)
+        ranges_m = belief.ends_m[belief.first[:, :-1].argmax(axis=1)]
+        ranges_m[belief.first[:, -1] > 0.5] = np.inf
+        for run in runs(hides, p.wall_gap):
+            # 1. The wall that hides just these directions, and the range of its foot beside them.
+            half_rad = 0.5 * ((run[-1] - run[0]) % count + 1) * (math.tau / count)
+            beside_rad = half_rad + 0.5 * p.wall_end * (math.tau / count)
+            if half_rad < p.wall_rad or beside_rad >= math.pi / 2:
+                continue
+            foot_m = self._near_m * math.cos(half_rad) / math.cos(beside_rad)
+            # 2. What is seen there: the lower quartile, as plain walls look like floor in some directions.
+            beside = np.array([run[0] - 1 - np.arange(p.wall_end), run[-1] + 1 + np.arange(p.wall_end)])
+            ends_m = np.quantile(ranges_m[beside % count], 0.25, axis=1, method="lower")
+            if ends_m.max() > foot_m + p.wall_m:
+                continue
+            azimuths = math.pi - self._turn_rad + yaw_rad - (beside.mean(axis=1) + 0.5) * (math.tau / count)
+            ends = foot_m * np.column_stack([np.cos(azimuths), np.sin(azimuths)])
+            corners = np.floor(self._eye + np.vstack([np.zeros(2), ends / CELL_M])).astype(np.int32)
+            before, wall = np.zeros((2, SIDE, SIDE), np.uint8)
+            cv2.fillConvexPoly(before, corners, 1)
+            cv2.line(wall, corners[1].tolist(), corners[2].tolist(), 1)
+            is_free, is_wall = (before > 0) & (self.odds < 0), wall > 0
+            self._known[is_free | is_wall], self._past_views[is_free] = 1, p.views
+            self.odds[is_free], self.odds[is_wall] = p.least, np.maximum(self.odds[is_wall], p.wall_nats)
 
     def _hides(self, belief: RayBelief) -> Flags:
         """Return the directions (D,) in which the nearest floor in view is hidden."""

@@ -87,7 +87,16 @@ class Slope:
     degrees: float
 
 
-Thing = Pole | Bar | Slope
+@dataclass(frozen=True)
+class Walls:
+    """Two plain walls along the way, on both sides of the robot, with skirting boards."""
+
+    aside_m: float
+    grey: float = 190.0
+    board_grey: float = 60.0
+
+
+Thing = Pole | Bar | Slope | Walls
 
 
 def panoramas(
@@ -131,6 +140,10 @@ def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing:
     if isinstance(thing, Pole):
         hidden = (np.abs(azimuth) < thing.width_m / thing.range_m / 2) & (r > thing.range_m)
         grey = np.where(hidden, thing.grey, grey)
+    elif isinstance(thing, Walls):
+        to_wall_m = thing.aside_m / np.abs(rays[:, 1])
+        of_wall = np.where(height_m + to_wall_m * rays[:, 2] < 0.08, thing.board_grey, thing.grey)
+        grey = np.where(to_wall_m < near, of_wall, grey)
     elif isinstance(thing, Bar):
         height = height_m + thing.range_m * rays[:, 2]
         grey = np.where((height > thing.heights_m[0]) & (height < thing.heights_m[1]), thing.grey, grey)

@@ -22,6 +22,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     Pole,
     Slope,
     Thing,
+    Walls,
     panoramas,
     plain,
     stains,
@@ -89,6 +90,7 @@ class Case:
         Case(stains, Pole(1.5, 0.08)),
         Case(plain, Pole(0.45, 0.08)),
         Case(worn, Pole(0.45, 0.08)),
+        Case(worn, Pole(0.45, 0.5)),
         Case(plain, Bar(1.4, (0.5, 0.56))),
         Case(stains, Bar(1.4, (0.5, 0.56))),
     ],
@@ -99,6 +101,16 @@ def test_floor_behind_a_plain_thing_is_not_free(case: Case) -> None:
     assert scan.free_m[AHEAD].max() < max(case.thing.range_m, 0.3) + 0.15
     if isinstance(case.thing, Pole):
         assert np.median(scan.free_m[BEHIND]) > 0.75 * WALL_M
+
+
+@pytest.mark.parametrize("aside_m", [0.4, 0.5])
+def test_a_base_may_begin_between_walls_nearer_than_the_floor_in_view(aside_m: float) -> None:
+    """What hides the nearest floor there goes on as a wall in view; it may stand anywhere only where it does not."""
+    free_m = Standing(worn).scan(Walls(aside_m), pairs=PAIRS).free_m
+    assert free_m[AHEAD].min() > 2.0 and free_m[BEHIND & (np.abs(azimuths()) > math.radians(178))].min() > 2.0
+    aside = np.abs(np.abs(azimuths()) - math.radians(60)) < math.radians(10)
+    to_wall_m = aside_m / np.sin(np.abs(azimuths()[aside]))
+    assert (np.abs(free_m[aside] - to_wall_m) < 3 * CELL_M).mean() > 0.9
 
 
 @pytest.mark.parametrize("floor", [plain, worn, stains])
