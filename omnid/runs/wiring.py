@@ -197,7 +197,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
 
     # 2. Poses go to the controller, which waits for no stage.
     if controller is not None:
-        graph.sink("controller", LiveDrive(controller, T_base_rig), poses, thread=poses.thread)
+        graph.sink("controller", LiveDrive(controller, T_base_rig, front_end.health), poses, thread=poses.thread)
         leaving.append(Leaving("drive", graph.source("drive", controller.commands, wake=controller.end)))
 
     # 3. Poses give the map, the pose in it, and the obstacles. A map that is extended needs no reader.

@@ -15,6 +15,7 @@ from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerState
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.frames import of_base
+from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate
 from omnid.navigation_state import with_reason
 from omnid.stages.obstacles import controller_scan
@@ -27,12 +28,14 @@ NAVIGATION_SENDER: Final = "navigation"  # identity of the sender, which keeps o
 class LiveDrive:
     """Sends the poses of `omnid run` to the controller; setpoints come from the network."""
 
-    def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64]) -> None:
-        self._link, self._T_base_rig = link, T_base_rig
+    def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64], health: RigHealth) -> None:
+        """health: of the rig; the wheels have no pose to turn by until the first pairs were judged."""
+        self._link, self._T_base_rig, self._health = link, T_base_rig, health
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Send a pose."""
-        self._link.send(controller_pose(odometry, self._T_base_rig))
+        if not self._health.is_undecided:
+            self._link.send(controller_pose(odometry, self._T_base_rig))
 
     def finish(self) -> None:
         """Have the wheels slow down to a stop: there will be no more poses."""

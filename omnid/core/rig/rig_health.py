@@ -237,6 +237,11 @@ class RigHealth:
         return self._mode != "off" and self.state is RigState.UNCHECKED
 
     @property
+    def is_undecided(self) -> bool:
+        """True until the first pairs were judged, at most four rounds of VIEWS of them, though they showed nothing."""
+        return self.is_checking and self.finding is None
+
+    @property
     def warning(self) -> str:
         """One line about a rig that the images contradict, or could not check, and what to do; else empty."""
         if (finding := self.finding) is None:

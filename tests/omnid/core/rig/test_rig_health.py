@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from omnid.core.rig.rig_health import VIEWS, RigContradictedError, RigHealth, Ri
 from omnid.core.types.panorama import Panoramas
 from omnid.diagnostics.status import rig_stats
 from omnid.engine.graph import Graph
+from omnid.sinks.drive import LiveDrive
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Dewarp, Geometry, geometry
 from omnid.stages.synchronise import Synchronise
@@ -159,6 +161,20 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(place: Geometry, true
     assert poses.process(true[1][8]).state is TrackingState.DEGRADED
     fits = FrontEnd(place, config, RigHealth(place.cylinder, "refuse", PERIOD_S))
     assert fits.process(true[1][8]).state is TrackingState.TRACKING
+
+
+@pytest.mark.hazard("H35")
+def test_the_wheels_get_no_pose_before_the_first_pairs_were_judged(
+    place: Geometry, turned: Turned, true: tuple[RigHealth, Collector]
+) -> None:
+    """Two pairs show that a rig is right; one that seems wrong is judged again before the run ends by it."""
+    for pairs, needed in ((true[1][:4], 2), (turned((3.0, 0.0, 0.0))[1][:4], 4)):
+        sent: list[object] = []
+        front_end = FrontEnd(place, Config(), RigHealth(place.cylinder, "warn", PERIOD_S))
+        drive = LiveDrive(SimpleNamespace(send=sent.append), np.eye(4), front_end.health)  # type: ignore[arg-type]
+        for number, pair in enumerate(pairs, 1):
+            drive.process(front_end.process(replace(pair, stamp_ns=number * SECONDS)))
+            assert bool(sent) == (number >= needed)
 
 
 def test_the_status_has_the_result_of_the_start(
