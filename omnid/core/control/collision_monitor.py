@@ -388,10 +388,10 @@ class CollisionMonitor:
         elif kind.reason == UNOBSERVED:
             return FREE
         else:
-            # Corners may swing as far as floor was seen. An unknown region that begins within two cells of the outline
-            # does not count: it would keep the base from turning away.
+            # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
+            # would keep the base from turning away.
             stop = self._stop_polygon(motion)
-            points = [point for point in points if stop.depth_m(*point) > 2 * BESIDE_M]
+            points = [point for point in points if stop.depth_m(*point) > 0.0]
             speed_mps = abs(motion.yaw_rate_radps) * outline.radius_m
         least = 0.0 if kind.policy == STOP else min(1.0, settings.slow_mps / speed_mps)
         share = max(self._share_before(points, motion, ALONG_SLOPE), least)
