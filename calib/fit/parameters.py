@@ -171,10 +171,6 @@ class RigParameters:
             matrix[np.ix_(known, known)] = of_boards + MIN_PART**2 * matrix[np.ix_(known, known)]
         return np.asarray(np.linalg.inv(matrix))
 
-    def moves_camera(self, camera: int) -> Array:
-        """Return flags (P,) of the steps that change the image of the lower (0) or the upper (1) camera."""
-        return np.array([name == LINE_TIME or name.startswith("lower ") == (camera == 0) for name in self.names])
-
     def at(self, steps: Array) -> Rig:
         """Return the rig after steps (P,). Raise CalibError where they lead to parameters that no camera has."""
         changes = dict(zip(self.names, (steps * self.units).tolist(), strict=True))

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib import se3
-from calib.fit.least_squares import BEST_STEP, KERNEL_WIDTH, SIGMA_PER_MAD, central_differences
+from calib.fit.least_squares import BEST_STEP, KERNEL_WIDTH, central_differences, robust_sigma
 from calib.models.camera import NEWTON_STEPS, Array
 from calib.rig import Rig
 
@@ -71,7 +71,7 @@ def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift:
             lambda step, about=about: _residuals(about + step, lower, upper),  # type: ignore[misc]
             BEST_STEP * np.ones(5),
         )
-        sigma = max(BEST_STEP, SIGMA_PER_MAD * float(np.median(np.abs(residual - np.median(residual)))))
+        sigma = robust_sigma(residual - np.median(residual))
         weight = 1 / (1 + (residual / (KERNEL_WIDTH * sigma)) ** 2) ** 2
         variance = CORRELATED_POINTS * sigma**2
         H = (J * weight[:, None]).T @ J / variance + prior

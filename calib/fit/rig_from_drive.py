@@ -24,10 +24,11 @@ from calib.fit.least_squares import (
     KERNEL_WIDTH,
     ROUNDS,
     ArrowSystem,
+    central_differences,
     minimise,
     robust_sigma,
 )
-from calib.fit.parameters import RigParameters
+from calib.fit.parameters import LINE_TIME, RigParameters
 from calib.models.camera import Array
 from calib.models.ocam import project_near
 from calib.rig import Rig
@@ -268,11 +269,8 @@ class DriveProblem:
         """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""
         rig, camera = self.parameters.at(steps), self.observations.camera
         reach = BEST_STEP * np.linalg.norm(points, axis=1, keepdims=True)
-        columns = [
-            (project(rig, camera, points + reach * axis) - project(rig, camera, points - reach * axis)) / (2 * reach)
-            for axis in np.eye(3)
-        ]
-        return np.asarray(np.nan_to_num(np.stack(columns, axis=-1)))
+        J = central_differences(lambda by: project(rig, camera, points + reach * by), np.ones(3))
+        return np.asarray(np.nan_to_num(J / reach[:, :, None]))
 
     def _by_steps(self, state: DriveState) -> Array:
         """Return the derivative (M, 2, P) of the pixels by the rig's steps."""
@@ -280,8 +278,9 @@ class DriveProblem:
         J = np.zeros((len(camera), 2, len(state.steps)))
         in_rig = self.in_rig(state, state.steps)
         for k, step in enumerate(BEST_STEP * np.eye(len(state.steps))):
-            at = np.isin(camera, [side for side in (0, 1) if parameters.moves_camera(side)[k]])
-            is_time = parameters.names[k] in parameters.times
+            name = parameters.names[k]
+            at = (camera == (0 if name.startswith("lower ") else 1)) | (name == LINE_TIME)
+            is_time = name in parameters.times
             ahead, behind = (
                 project(parameters.at(steps), camera[at], (self.in_rig(state, steps) if is_time else in_rig)[at])
                 for steps in (state.steps + step, state.steps - step)

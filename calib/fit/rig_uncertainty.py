@@ -97,7 +97,7 @@ def seen_points(rig: Rig) -> Array:
         part.ravel() for part in np.meshgrid(2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SLOPES, WALLS_M)
     )
     points = distance[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth), slope])
-    pixels = _pixels(rig, points)
+    pixels = _pixels(rig, se3.apply(se3.inverse(rig.T_rect_rig), points))
     seen = [
         mounted.visible.contains(side)
         for mounted, side in zip((rig.lower, rig.upper), np.split(pixels, 2, axis=1), strict=True)
@@ -105,9 +105,8 @@ def seen_points(rig: Rig) -> Array:
     return np.asarray(points[np.isfinite(pixels).all(axis=1) & seen[0] & seen[1]])
 
 
-def _pixels(rig: Rig, points: Array) -> Array:
-    """Return the pixels (N, 4) in the lower and the upper camera of points (N, 3) in the rectified frame."""
-    in_rig = se3.apply(se3.inverse(rig.T_rect_rig), points)
+def _pixels(rig: Rig, in_rig: Array) -> Array:
+    """Return the pixels (N, 4) in the lower and the upper camera of points (N, 3) in the rig frame."""
     return np.column_stack(
         [mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig)) for mounted in (rig.lower, rig.upper)]
     )
@@ -128,7 +127,10 @@ def _motion_by_parameters(
     ends = se3.apply(T_end_start, points)
     first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
     by_start, by_end = (
-        central_differences(lambda shift, at=at: _pixels(rig, at + shift), BEST_STEP * np.ones(3))  # type: ignore[misc]
+        central_differences(
+            lambda shift, at=at: _pixels(rig, se3.apply(T_rig_rect, at + shift)),  # type: ignore[misc]
+            BEST_STEP * np.ones(3),
+        )
         for at in (points, ends)
     )
     seen = np.all([np.isfinite(part).all(axis=(1, 2)) for part in (first, last, by_start, by_end)], axis=0)
@@ -147,9 +149,6 @@ def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...]
     names, units = scaled
 
     def pixels(changes: Array) -> Array:
-        changed = moved_rig(rig, dict(zip(names, (changes * units).tolist(), strict=True)))
-        return np.column_stack(
-            [mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig)) for mounted in (changed.lower, changed.upper)]
-        )
+        return _pixels(moved_rig(rig, dict(zip(names, (changes * units).tolist(), strict=True))), in_rig)
 
     return central_differences(pixels, np.ones(len(names)))

@@ -50,14 +50,12 @@ class Mask:
         radius = np.hypot(pixels[:, 0] - self.center[0], pixels[:, 1] - self.center[1])
         inner = self.inner_px + margin_px if self.inner_px > 0 else 0.0
         inside = (radius >= inner) & (radius <= self.outer_px - margin_px)
-        return inside if self.image is None else inside & self._painted(pixels)
-
-    def _painted(self, pixels: Array) -> NDArray[np.bool_]:
-        assert self.image is not None
+        if self.image is None:
+            return inside
         height, width = self.image.shape
         finite = np.asarray(np.isfinite(pixels).all(axis=1))
         column, row = np.rint(np.where(finite[:, None], pixels, -1)).astype(int).T
-        inside = finite & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside &= finite & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         return np.asarray(inside & (self.image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)] > 0))
 
 

@@ -58,7 +58,7 @@ class OcamCamera:
         values = [value for part in (*parts, self.wavefront) for value in part]
         c, d, e = self.affine
         with np.errstate(all="ignore"):
-            values.append(float(self.height(np.hypot(*self.size))) if self.polynomial else np.nan)
+            values.append(float(self.height_and_slope(np.hypot(*self.size))[0]) if self.polynomial else np.nan)
         if not (
             np.isfinite(values).all()
             and self.polynomial[0] < 0
@@ -72,7 +72,7 @@ class OcamCamera:
             )
         radii = np.linspace(0, self.radius_limit_px, TABLE_SIZE)
         object.__setattr__(self, "_radii", radii)
-        object.__setattr__(self, "_angles", np.maximum.accumulate(np.arctan2(self.height(radii), radii)))
+        object.__setattr__(self, "_angles", np.maximum.accumulate(np.arctan2(self.height_and_slope(radii)[0], radii)))
 
     @property
     def center(self) -> tuple[float, float]:
@@ -92,10 +92,6 @@ class OcamCamera:
         real = turning.real[np.isreal(turning) & (turning.real > 0)]
         return min(diagonal, float(real.min())) if real.size else diagonal
 
-    def height(self, radius_px: Array | float) -> Array:
-        """Return f(rho) (N,) [px]: the ray's third component before the mirror's sign."""
-        return np.asarray(np.polynomial.polynomial.polyval(radius_px, self.polynomial))
-
     def lift(self, pixels: Array) -> Array:
         """Return unit rays (N, 3) of pixels (N, 2); NaN beyond the model's radius. Scaramuzza et al. 2006, eq. (6)."""
         pixels = np.asarray(pixels, float)
@@ -106,7 +102,7 @@ class OcamCamera:
             x, y = undistorted(self.distort, self.distortion_jacobian, (x, y))
             x = np.where(self._is_unfolded(x, y), x, np.nan)
         rho = np.hypot(x, y)
-        z = self.height(np.where(rho <= self._radii[-1], rho, np.nan))
+        z, _ = self.height_and_slope(np.where(rho <= self._radii[-1], rho, np.nan))
         rays = np.column_stack([x, y, self.sign * z])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         if any(self.wavefront):
@@ -121,18 +117,14 @@ class OcamCamera:
         points = np.asarray(points, float)
         if any(self.wavefront):
             norm = np.linalg.norm(points, axis=1, keepdims=True)
-            at = self.distance_m * points / np.where(norm > 0, norm, np.nan)
-            points = wavefronts.directions_to(at, self.wavefront, -self.sign)
-        return self._project_rays(points)
+            points = self.distance_m * points / np.where(norm > 0, norm, np.nan)
+        return self.project_near(points)
 
     def project_near(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3) [m] at their own distances; like project() without a wavefront."""
         points = np.asarray(points, float)
         if any(self.wavefront):
             points = wavefronts.directions_to(points, self.wavefront, -self.sign)
-        return self._project_rays(points)
-
-    def _project_rays(self, points: Array) -> Array:
         r = np.hypot(points[:, 0], points[:, 1])
         rho = self.radius(r, self.sign * points[:, 2])
         scale = rho / np.where(r > 0, r, 1.0)
@@ -201,7 +193,10 @@ class OcamCamera:
         return np.where(np.isfinite(unit) & (angle <= self._angles[-1]), rho, np.nan)
 
     def height_and_slope(self, radius_px: Array) -> tuple[Array, Array]:
-        """Return f(rho) and f'(rho), both (N,), by one Horner scheme: numpy's two take most of a calibration's time."""
+        """Return f(rho) (N,) [px], the ray's third component before the mirror's sign, and f'(rho) (N,).
+
+        By one Horner scheme: numpy's two take most of a calibration's time.
+        """
         height, slope = np.full_like(radius_px, self.polynomial[-1]), np.zeros_like(radius_px)
         for coefficient in self.polynomial[-2::-1]:
             slope *= radius_px

@@ -249,9 +249,8 @@ class _BoardProblem:
         freedom = 2 * float(weight.sum()) - len(units) - 6 * len(residual)
         variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
         # 2. The covariance. The radii of the mirrors are no parameters of a rig.
-        K, C, N, _ = self.pixels.shape
-        fields = smooth_fields(self.pixels.reshape(K, C * N, 2), C).reshape(K, C, N, 2, -1)
-        system = self.normal_equations(state, self.kernel_px, fields).reduced()
+        C = len(state.rig.cameras)
+        system = self.normal_equations(state, self.kernel_px, smooth_fields(self.pixels)).reduced()
         covariance = covariance_with_misfit(*system, len(units), variance) * np.outer(units, units)
         own = [(*state.rig.names, "radius")] * C
         names = [name for side in own for name in side] + [""] * (len(units) - C * len(own[0]))
@@ -432,23 +431,23 @@ RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])
 MIN_EIGENVALUE_RATIO = 1e-3
 
 
-def smooth_fields(pixels: Array, cameras: int) -> Array:
-    """Return the fields (K, N, 2, F) at pixels (K, N, 2), of which equal parts belong to each camera.
+def smooth_fields(pixels: Array) -> Array:
+    """Return the fields (K, C, N, 2, F) at the pixels (K, C, N, 2) of C cameras, of which each has its own.
 
     Rows of unknown pixels (NaN) are 0. The sum of all fields has about unit size.
     """
-    K, N, _ = pixels.shape
+    K, C, N, _ = pixels.shape
     line, width = np.linspace(-1, 1, NODES), 2 / (NODES - 1)
     nodes = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    fields = np.zeros((K, cameras, N // cameras, 2, cameras, len(nodes)))
-    for camera, part in enumerate(np.split(pixels, cameras, axis=1)):
+    fields = np.zeros((K, C, N, 2, C, len(nodes)))
+    for camera, part in enumerate(np.moveaxis(pixels, 1, 0)):
         known = part[np.isfinite(part).all(axis=2)]
         center = known.mean(axis=0)
         radius = float(np.linalg.norm(known - center, axis=1).max())
         away = ((part[:, :, None] - center) / radius - nodes) / width
         gaussian = np.exp(-0.5 * (away**2).sum(axis=3, keepdims=True))
         fields[:, camera, :, :, camera] = np.nan_to_num(-away * gaussian).swapaxes(2, 3)
-    return fields.reshape(K, N, 2, -1)
+    return fields.reshape(K, C, N, 2, -1)
 
 
 def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, variance: float) -> Array:

@@ -214,5 +214,5 @@ def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(
     assert (row + 1, column + 1) == pytest.approx((numbers["xc_row_1based"], numbers["yc_col_1based"]), abs=3.0)
     radius = np.linspace(100, 350, 26)
     theirs = np.polynomial.polynomial.polyval(radius, numbers["ss"])
-    ours = found.cameras[0].height(radius)
+    ours = found.cameras[0].height_and_slope(radius)[0]
     assert np.rad2deg(np.abs(np.arctan2(ours, radius) - np.arctan2(theirs, radius))).max() < apart_deg
