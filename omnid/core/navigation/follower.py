@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib.se2_arrays import predicted
 from omnid.core.control.collision_monitor import LEAST_MPS
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
-from omnid.core.navigation.path import DrivePath, PathLeg, straight_leg
+from omnid.core.navigation.path import BEGIN, DrivePath, PathLeg, PathPlace, straight_leg
 from omnid.core.navigation.settings import NavigationSettings
 
 Array = NDArray[np.float64]
@@ -37,29 +37,20 @@ class Following(NamedTuple):
     setpoint: Setpoint  # its heading is in the frame of the path
     left_m: float  # way to the end of the path; below 0 past it
     offset_m: float = 0.0  # distance to the left of the path
-    done: bool = False
-    missed_m: float = 0.0  # distance to the goal, where done
-
-
-class PathAhead(NamedTuple):
-    """Points of a path, in its frame."""
-
-    xy: Array  # (N, 2)
-    legs: NDArray[np.intp]  # (N,) numbers of their legs
-    s: Array  # (N,) way on the leg
+    missed_m: float | None = None  # distance to the goal at the end of the drive; None before
 
 
 class Follower:
     """Drive a path to its end; poses are in the frame of the path."""
 
     def __init__(
-        self, path: DrivePath, settings: NavigationSettings, leg: int = 0, s_m: float = 0.0, speed_mps: float = 0.0
+        self, path: DrivePath, settings: NavigationSettings, place: PathPlace = BEGIN, speed_mps: float = 0.0
     ) -> None:
-        """leg, s_m: where on the path to begin. speed_mps: of the base, forwards."""
+        """place: where on the path to begin. speed_mps: of the base, forwards."""
         self.path, self.settings, self._legs = path, settings, list(path.legs)
         # True while the base turns at the end of the path.
-        self.aligns = path.length_m <= settings.goal_cm * 0.01 or leg >= len(path.legs)
-        self._begin(min(leg, len(path.legs) - 1), s_m, speed_mps)
+        self.aligns = path.length_m <= settings.goal_cm * 0.01 or place.leg >= len(path.legs)
+        self._begin(min(place.leg, len(path.legs) - 1), place.s_m, speed_mps)
         self._settled = self._corrections = 0
 
     def _begin(self, number: int, s_m: float = 0.0, speed_mps: float = 0.0) -> None:
@@ -74,21 +65,22 @@ class Follower:
 
     _last_ns: int | None
 
-    def ahead(self, way_m: float) -> PathAhead:
-        """Return the path from the nearest point on, of at least a length, through the next legs if need be."""
+    def ahead(self, way_m: float) -> tuple[Array, list[PathPlace]]:
+        """Return points (N, 2) of the path from the nearest one on, of at least a length, and their places on it."""
         if self.aligns:
-            return PathAhead(self.path.goal[None], np.array([self._number]), np.array([self._leg.length_m]))
-        pieces: list[tuple[Array, NDArray[np.intp], Array]] = []
+            return self.path.goal[None], [PathPlace(self._number, self._leg.length_m)]
+        pieces: list[Array] = []
+        places: list[PathPlace] = []
         s_m, left_m = self._s_m, way_m
         for number in range(self._number, len(self._legs)):
             leg = self._legs[number]
             within = (leg.s > s_m) & (leg.s <= s_m + left_m)
-            s = np.append(s_m, leg.s[within])
-            pieces.append((np.vstack([leg.at(s_m)[None, :2], leg.xy[within]]), np.full(len(s), number), s))
+            pieces += [leg.at(s_m)[None, :2], leg.xy[within]]
+            places += [PathPlace(number, s) for s in (s_m, *leg.s[within].tolist())]
             left_m, s_m = left_m - (leg.length_m - s_m), 0.0
             if left_m <= 0:
                 break
-        return PathAhead(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+        return np.vstack(pieces), places
 
     def step(
         self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
@@ -121,7 +113,7 @@ class Follower:
             return Following(STANDSTILL if goal_rad is None else Setpoint(0.0, goal_rad), missing_m)
         # 3. Drive what is missing then, or end.
         if missing_m <= goal_m or self._corrections >= CORRECTIONS:
-            return Following(STANDSTILL, 0.0, 0.0, True, missing_m)
+            return Following(STANDSTILL, 0.0, 0.0, missing_m)
         self._corrections, self._settled, self.aligns = self._corrections + 1, 0, False
         aside_rad = abs(wrap_angle(math.atan2(missing[1], missing[0]) - float(pose[2])))
         self._legs.append(straight_leg(pose, self.path.goal, backwards=aside_rad > math.pi / 2))

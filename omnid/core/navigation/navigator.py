@@ -20,14 +20,14 @@ from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.follower import BRAKE_SHARE, STANDSTILL, Follower, Following
-from omnid.core.navigation.path import SHORTEST_M, DrivePath, goal_path
-from omnid.core.navigation.planner import Move, Planner
+from omnid.core.navigation.path import BEGIN, SHORTEST_M, DrivePath, PathPlace, goal_path, ways_m
+from omnid.core.navigation.planner import Move, Planner, Way
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
 from omnid.core.navigation.surroundings import Surroundings
 from omnid.navigation_state import NavigationState
-from omnid.tracking_state import MapState, TrackingState
+from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
@@ -55,10 +55,8 @@ class Detour(NamedTuple):
     """A way of the planner, to the goal or back to the path."""
 
     follower: Follower  # in odom
-    time_s: float  # for all of it
-    length_m: float  # of all of it
-    leg: int = 0  # of the path, to which it leads back
-    s_m: float = 0.0  # on that leg
+    way: Way
+    place: PathPlace  # on the path, to which it leads back
 
 
 @dataclass(slots=True)
@@ -102,7 +100,7 @@ class Drive:
 
     def ahead(self, now: Situation, way_m: float) -> Array:
         """Return the points (N, 2) of the way ahead, in odom."""
-        xy = self.on_way.ahead(way_m).xy
+        xy, _ = self.on_way.ahead(way_m)
         return xy if self.detour is not None else self.in_odom(xy, now)
 
     def step(self, now: Situation, clearance_m: float) -> Following:
@@ -110,7 +108,7 @@ class Drive:
         motion = now.speed_mps, now.yaw_rate_radps, clearance_m
         if self.detour is not None:
             following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
-            if not following.done and following.left_m >= SHORTEST_M:
+            if following.missed_m is None and following.left_m >= SHORTEST_M:
                 return following
             self.rejoin(now)
         following = self.follower.step(now.stamp_ns, now.pose_in(self.frame), *motion)
@@ -121,18 +119,13 @@ class Drive:
         setpoint = replace(following.setpoint, heading_rad=wrap_angle(heading_rad - turned_rad))
         return following._replace(setpoint=setpoint)
 
-    def begin_detour(self, detour: Detour) -> None:
-        """Begin a detour."""
-        self.detour, self.nearest_m, self.way_s = detour, math.inf, 0.0
-
     def rejoin(self, now: Situation) -> None:
         """Follow the path again, from the place to which the detour leads; to a goal straight on."""
-        path, detour = self.paths[0], self.detour
-        leg, s_m = (0, 0.0) if detour is None else (detour.leg, detour.s_m)
+        path, place = self.paths[0], BEGIN if self.detour is None else self.detour.place
         if path.is_goal:
-            path, leg, s_m = goal_path(now.pose_in(self.frame), path.goal, path.final_heading_rad), 0, 0.0
+            path = goal_path(now.pose_in(self.frame), path.goal, path.final_heading_rad)
         self.detour, self.nearest_m = None, math.inf
-        self.follower = Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
+        self.follower = Follower(path, self.follower.settings, place, now.speed_mps)
 
     def advance(self, now: Situation, left_m: float, dt_s: float) -> None:
         """Count the time since the last progress, a shorter way to go or a turn, and the time on this way."""
@@ -255,7 +248,7 @@ class Navigator:
         following = drive.step(now, self._clearance_m(drive, now))
         move = _kind(following.setpoint)
         drive.move = drive.move if move is None else move
-        if following.done:
+        if following.missed_m is not None:
             return self._finished(drive, following.missed_m)
         if abs(following.offset_m) > settings.corridor_m + self._planner.required_m:
             return self._end(
@@ -265,20 +258,20 @@ class Navigator:
         if following.left_m < drive.least_m - NEARER_M:
             drive.least_m, drive.ways, drive.lost_s, drive.tried_s = following.left_m, 0, 0.0, 0.0
         # 3. Obstacles on the way, and a safety rule that holds the wheels because of an obstacle.
-        following, setpoint, reason = self._around_obstacles(drive, now, following)
-        held_by = now.wheels.held_by
-        if setpoint is None or held_by:  # Held wheels still get it: the monitor releases them.
-            return self._blocked(drive, reason if setpoint is None else held_by, following, dt_s, setpoint)
+        following, obstacle = self._around_obstacles(drive, now, following)
+        if obstacle or now.wheels.held_by:  # Held wheels still get the motion: the monitor releases them.
+            return self._blocked(drive, obstacle, now.wheels.held_by, following, dt_s)
         # 4. The drive fails after too long a time without progress.
         avoids = drive.detour is not None
         drive.advance(now, following.left_m, dt_s)
+        held_by = now.wheels.reason if now.wheels.is_held else ""
         if drive.stuck_s > settings.stuck_s:
-            why = now.wheels.reason if now.wheels.is_held else AROUND if avoids else ""
+            why = held_by or (AROUND if avoids else "")
             parts = f"no progress for {settings.stuck_s:g} s", why, "look at the robot"
             return self._end(NavigationState.FAILED, ": ".join(part for part in parts if part))
         self.state = NavigationState.AVOIDING if avoids else NavigationState.DRIVING
-        self.reason, drive.waited_s = now.wheels.reason if now.wheels.is_held else reason, 0.0
-        return Navigation(setpoint, self.state, self.reason, following.left_m, following.offset_m)
+        self.reason, drive.waited_s = held_by, 0.0
+        return Navigation(following.setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _follow_map(self, drive: Drive, now: Situation) -> None:
         """Add to the distance driven without a pose in the map; drop a detour after a reset of odometry."""
@@ -289,7 +282,7 @@ class Navigator:
         in_map = now.in_map
         if in_map is None or in_map.stamp_ns <= drive.localised_ns:  # no new pose in the map has come
             return
-        if in_map.state is MapState.LOCALIZED and in_map.sigma_m <= self.settings.map_sigma_m:
+        if not refusal_of_map(now, self.settings.map_sigma_m):
             drive.unlocalised_m, drive.localised_ns = 0.0, in_map.stamp_ns
         elif in_map.sigma_m > UNKNOWN_M:
             drive.unlocalised_m = math.inf
@@ -312,13 +305,11 @@ class Navigator:
         near = drive.ahead(now, self.collision.front_m)
         return float(now.around.distance_at(near).min()) - self.collision.half_width_m
 
-    def _around_obstacles(
-        self, drive: Drive, now: Situation, following: Following
-    ) -> tuple[Following, Setpoint | None, str]:
-        """Return progress, motion and the reason why it is slower than wanted; no motion where no way is free."""
-        around, wanted = now.around, following.setpoint
+    def _around_obstacles(self, drive: Drive, now: Situation, following: Following) -> tuple[Following, str]:
+        """Return progress with the motion on a free way; without one no motion, and what is in the way."""
+        around = now.around
         if around is None or drive.on_way.aligns:
-            return following, wanted, ""
+            return following, ""
         # 1. Search another way if this one is blocked, or if a shorter one to the goal may be free by now.
         pursuit, required_m = self.settings.pursuit, self._planner.required_m
         look = now.stamp_ns, pursuit.velocity_mps
@@ -326,18 +317,17 @@ class Navigator:
         first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), kept_m, *look)
         if self._begin_other_way(drive, now, around, following, is_closed=first_m < math.inf):
             following = drive.step(now, self._clearance_m(drive, now))
-            wanted = following.setpoint
             first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), required_m, *look)
         # 2. Without another way, wait: on a blocked detour at once, on the path in front of the obstacle.
-        if first_m < math.inf and drive.detour is not None and drive.no_way:
-            return following, None, CROSSES if around.has_moving else OBSTRUCTED
+        wanted = following.setpoint
         left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
         braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
-        if wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps:  # the base has reached the obstacle
-            return following, None, CROSSES if around.has_moving else OBSTRUCTED
+        has_reached = wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps
+        if has_reached or (first_m < math.inf and drive.detour is not None and drive.no_way):
+            return following._replace(setpoint=STANDSTILL), CROSSES if around.has_moving else OBSTRUCTED
         share = min(1.0, braking_mps / wanted.velocity_mps) if wanted.velocity_mps > 0 else 1.0
         slower = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
-        return following, slower, ""
+        return following._replace(setpoint=slower), ""
 
     def _begin_other_way(
         self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_closed: bool
@@ -372,53 +362,53 @@ class Navigator:
         if is_blocked:
             may_leave = is_closed and (detour is None or around.has_moving)
             worth_m = following.left_m + LOOK_M + settings.pursuit.velocity_mps * drive.lost_s
-            drive.is_waiting = may_leave and found.length_m > worth_m
+            drive.is_waiting = may_leave and found.way.length_m > worth_m
             if drive.is_waiting:
                 return False
         elif detour is not None:
-            left_s = detour.time_s * following.left_m / max(detour.follower.path.length_m, SHORTEST_M)
-            if found.time_s > BETTER * left_s:
+            left_s = detour.way.time_s * following.left_m / max(detour.way.path.length_m, SHORTEST_M)
+            if found.way.time_s > BETTER * left_s:
                 return False
-        drive.begin_detour(found)
+        drive.detour, drive.nearest_m, drive.way_s = found, math.inf, 0.0
         return True
 
     def _search(self, drive: Drive, now: Situation, around: Surroundings, barred: Move | None) -> Detour | str:
         """Return a way to the goal, or to the path behind its obstacle; or the reason why there is none."""
         settings, path = self.settings, drive.paths[0]
-        place, corridor, heading_rad = (0, 0.0), None, math.nan
+        place, corridor, heading_rad = BEGIN, None, math.nan
         if path.is_goal:
             goal = drive.in_odom(path.goal[None], now)[0]
         else:
-            ahead = drive.follower.ahead(2 * LOOK_M)
-            corridor = drive.in_odom(ahead.xy, now)
+            xy, places = drive.follower.ahead(2 * LOOK_M)
+            corridor = drive.in_odom(xy, now)
             distances = around.distance_m if barred is None else around.closed_distance_m
             distance_m = around.path_distance_m(corridor, now.stamp_ns, settings.pursuit.velocity_mps, distances)
             k = _behind(corridor, distance_m < self._planner.required_m + settings.clearance_m)
             if k is None:
                 return "the path is not free within sight"
-            goal, place = corridor[k], (int(ahead.legs[k]), float(ahead.s[k]))
-            leg = path.legs[min(place[0], len(path.legs) - 1)]
-            heading_rad = leg.at(place[1])[2] + (math.pi if leg.backwards else 0.0)
+            goal, place = corridor[k], places[k]
+            leg = path.legs[min(place.leg, len(path.legs) - 1)]
+            heading_rad = leg.at(place.s_m)[2] + (math.pi if leg.backwards else 0.0)
             heading_rad -= float(now.T_frame_odom(drive.frame)[2])
         found = self._planner.way(
             now.pose, goal, around, now.stamp_ns, along=corridor, heading_rad=heading_rad, barred=barred
         )
         if isinstance(found, str):
             return found
-        length_m = found.path.length_m + math.dist(found.path.goal, goal)
-        return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found.time_s, length_m, *place)
+        return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found, place)
 
-    def _blocked(
-        self, drive: Drive, reason: str, following: Following, dt_s: float, setpoint: Setpoint | None
-    ) -> Navigation:
-        """Wait for a free way; fail if for too long none leads to a goal. Paths and routes never give up."""
+    def _blocked(self, drive: Drive, obstacle: str, held_by: str, following: Following, dt_s: float) -> Navigation:
+        """Wait for a free way; fail if for too long none leads to a goal. Paths and routes never give up.
+
+        obstacle: on the way; empty: the collision monitor holds the base on a free one, by held_by.
+        """
         drive.lost_s += dt_s
         lost_s = drive.lost_s + (drive.tried_s if drive.no_way else 0.0)
         if drive.paths[0].is_goal and not drive.is_waiting and 0 < self.settings.give_up_s < lost_s:
-            why = reason if setpoint is not None else drive.no_way or reason
+            why = (drive.no_way or obstacle) if obstacle else held_by
             return self._end(NavigationState.FAILED, f"no way to the goal, {following.left_m:.1f} m are left: {why}")
-        self.state, self.reason = NavigationState.BLOCKED, f"{reason}: {WAITS}"
-        return Navigation(setpoint or STANDSTILL, self.state, self.reason, following.left_m, following.offset_m)
+        self.state, self.reason = NavigationState.BLOCKED, f"{obstacle or held_by}: {WAITS}"
+        return Navigation(following.setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:
         """Begin the next path, or end."""
@@ -439,7 +429,7 @@ class Navigator:
 
 def _behind(path: Array, is_blocked: NDArray[np.bool_]) -> int | None:
     """Return the first point of a path (N, 2) behind an obstacle about which REJOIN_M of it are free; None without."""
-    ways = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+    ways = ways_m(path)
     free_from = int(np.argmax(is_blocked))
     for k in range(free_from, len(path)):
         if is_blocked[k]:

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,6 +61,16 @@ class PathLeg:
         x, y, heading = (float(np.interp(inside, self.s, v)) for v in (self.xy[:, 0], self.xy[:, 1], self.heading))
         beyond = s_m - inside
         return np.array([x + beyond * math.cos(heading), y + beyond * math.sin(heading), heading])
+
+
+class PathPlace(NamedTuple):
+    """A place on a path."""
+
+    leg: int  # its number; past the last one: the end
+    s_m: float  # way on the leg
+
+
+BEGIN: Final = PathPlace(0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +129,11 @@ def goal_path(pose: ArrayLike, goal: ArrayLike, heading_rad: float | None = None
     return DrivePath((straight_leg(pose, goal),), heading_rad, True)
 
 
+def ways_m(path: Array) -> Array:
+    """Return the way (N,) along a path (N, 2), or along poses (N, 3), to each of its points."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T)))
+
+
 def straight_leg(start: ArrayLike, goal: ArrayLike, *, backwards: bool = False) -> PathLeg:
     """Return the straight way between two positions (2,), however near they are."""
     ends = np.array([np.asarray(end, np.float64)[:2] for end in (start, goal)])
@@ -139,7 +154,7 @@ def _spaced(xy: Array, back: NDArray[np.bool_]) -> list[int]:
 
 def _leg(xy: Array, speeds: Array, backwards: bool) -> PathLeg:
     """Return the leg through points (N, 2) with highest speeds (N,), sampled at equal distances."""
-    ways = np.append(0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T)))
+    ways = ways_m(xy)
     count = max(2, math.ceil(ways[-1] / STEP_M) + 1)
     s = np.linspace(0.0, ways[-1], count)
     fine = np.column_stack([np.interp(s, ways, xy[:, 0]), np.interp(s, ways, xy[:, 1])])

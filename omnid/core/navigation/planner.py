@@ -45,7 +45,9 @@ class Way(NamedTuple):
     """A way that was found."""
 
     path: DrivePath  # in odom
-    time_s: float  # to the goal; from the edge of the grid straight on
+    # To the goal, from the end of the path straight on:
+    time_s: float
+    length_m: float
 
 
 class Planner:
@@ -158,7 +160,8 @@ class Planner:
         if len(xy) < 2:
             return "the base does not fit through"
         speeds = np.where(is_back, BACK_MPS, velocity_mps)
-        return Way(drive_path(xy, speeds=speeds, backwards=[bool(back) for back in is_back]), time_s)
+        path = drive_path(xy, speeds=speeds, backwards=[bool(back) for back in is_back])
+        return Way(path, time_s, path.length_m + math.dist(path.goal, goal))
 
     def _times(self, start: Array, around: Surroundings, along: Array | None) -> Array:
         """Return the time across each cell [s], inf where the base cannot be, or may not; start (2,): its cell."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative, wrapped
 from omnid.core.control.collision_monitor import LEAST_MPS as STANDING_MPS
-from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path
+from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path, ways_m
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
@@ -196,14 +196,14 @@ def repeated_paths(
         raise OmnidError(
             f"the robot is {least_m:.1f} m away from {where}: drive it there, to within {ENTRY_M:g} m, {to}"
         )
-    ways_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0).T)))
-    if loops == 1 and ways_m[-1] <= BESIDE_M:
+    ways = ways_m(poses[first:])
+    if loops == 1 and ways[-1] <= BESIDE_M:
         raise OmnidError("the robot is at the end of the route: repeat it in reverse, or drive to its start first")
     # 2. A robot beside the route joins it farther on, before the next corner.
     is_beside = away_m[first] > BESIDE_M
     if is_beside and not from_start:
         goes_on = (
-            (ways_m <= JOIN * away_m[first])
+            (ways <= JOIN * away_m[first])
             & (np.abs(wrapped(poses[first:, 2] - poses[first, 2])) < CORNER_RAD)
             & (directed.speeds[first:] * directed.speeds[first] > 0)
         )
@@ -213,8 +213,8 @@ def repeated_paths(
     paths = [_path(directed, poses, first, pose if is_beside else None)]
     if loops > 1:
         rounds = [directed] if route.is_closed else [directed, directed.reversed()]
-        ways = [_path(each, each.in_map(keyframes), 0) for each in rounds]
-        paths += [ways[k % len(ways)] for k in range(1, loops)]
+        whole = [_path(each, each.in_map(keyframes), 0) for each in rounds]
+        paths += [whole[k % len(whole)] for k in range(1, loops)]
     return paths
 
 
@@ -223,8 +223,8 @@ def _nearest(route: Route, poses: Array, pose: Array, away_m: Array) -> int:
     cost = away_m + ENTRY_M_PER_RAD * np.abs(wrapped(poses[:, 2] - pose[2]))
     near = away_m <= ENTRY_M
     if route.is_closed:
-        way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-        before_end = near & (way_m < way_m[-1] - CLOSED_M)
+        ways = ways_m(poses)
+        before_end = near & (ways < ways[-1] - CLOSED_M)
         near = before_end if before_end.any() else near
     return int(np.argmin(np.where(near, cost, np.inf)))
 

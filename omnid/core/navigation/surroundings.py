@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
+from omnid.core.navigation.path import ways_m
 from omnid.core.obstacles.grid import CELL_M, OCCUPIED, SQUARE, UNKNOWN, FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 
@@ -127,7 +128,7 @@ class Surroundings:
         at_rest_m = self.distance_at(path, distances)
         if not self.has_moving:
             return at_rest_m
-        movers, times_s = self.movers(now_ns), _ways_m(path) / speed_mps
+        movers, times_s = self.movers(now_ns), ways_m(path) / speed_mps
         early, late = (
             movers[:, :2] + np.clip(times_s + shift_s, 0.0, HORIZON_S)[:, None, None] * movers[:, 2:4]
             for shift_s in (-MEETING_S, MEETING_S)
@@ -144,7 +145,7 @@ class Surroundings:
         if is_blocked[0]:
             leaves = np.minimum.accumulate(np.append(True, np.diff(distance_m) > -ROUNDING_M))
             is_blocked &= ~(leaves & np.minimum.accumulate(is_blocked))
-        return float(_ways_m(path)[np.argmax(is_blocked)]) if is_blocked.any() else math.inf
+        return float(ways_m(path)[np.argmax(is_blocked)]) if is_blocked.any() else math.inf
 
 
 def near_ends(pose: Array, ranges_m: Ranges, free_m: Ranges, collision: CollisionSettings) -> Array:
@@ -164,11 +165,6 @@ def near_ends(pose: Array, ranges_m: Ranges, free_m: Ranges, collision: Collisio
     surfaces = ranges_m[is_seen, None] * directions[is_seen]
     from_surface_m = np.linalg.norm(places[:, None] - surfaces, axis=2).min(axis=1, initial=math.inf)
     return np.asarray(pose[:2] + places[(away_m < NEAR_M) & (from_surface_m > collision.stop_m)])
-
-
-def _ways_m(path: Array) -> Array:
-    """Return the way (N,) along a path (N, 2) to each of its points."""
-    return np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
 
 
 def distances_m(flags: Flags) -> Array:
