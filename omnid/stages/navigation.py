@@ -30,7 +30,7 @@ from omnid.core.navigation.requests import (
 )
 from omnid.core.navigation.route import ENTRY_M, KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import MapPosition, Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.situation import MapPosition, Situation, refusal_of_map, require_drivable
 from omnid.core.navigation.surroundings import Surroundings, near_ends
 from omnid.errors import OmnidError
 from omnid.messages import (
@@ -79,6 +79,7 @@ class NavigationStage:
         self.map_name, self._routes, self._is_new = map_name, routes, is_new
         self._wheels = ControllerState()
         self._navigator = Navigator(settings, collision)
+        self._task, self._command_ns = "", 0  # words and stamp of the request for the drive, kept after its end
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self.keyframes = MapKeyframes({}, {})
@@ -180,9 +181,9 @@ class NavigationStage:
             case NavigationVerb.CANCEL:
                 navigator.cancel("by a request")
             case NavigationVerb.PAUSE:
-                _raise_if(navigator.pause(f"by a request: {RESUME}"))
+                navigator.pause(f"by a request: {RESUME}")
             case NavigationVerb.RESUME:
-                _raise_if(navigator.resume(self._situation()))
+                navigator.resume(self._situation())
             case GoalRequest() | PathRequest():
                 self._start(_word(command), request.frame, [self._path(request)], command)
             case RouteRequest(RouteAction.TEACH):
@@ -197,7 +198,8 @@ class NavigationStage:
                 self._start(f"route {request.name}", NavigationFrame.MAP, self._repeated(request), command)
 
     def _start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], command: NavigationCommand) -> None:
-        self._navigator.start(task, frame, paths, self._situation(), command.stamp_ns)
+        self._navigator.start(frame, paths, self._situation())
+        self._task, self._command_ns = task, command.stamp_ns
         xy = np.vstack([leg.xy for leg in paths[0].legs])
         self._plan = NavigationPlan(frame, xy, paths[0].final_heading_rad)
 
@@ -239,16 +241,16 @@ class NavigationStage:
 
     def _teach(self, request: RouteRequest) -> None:
         """Begin to record: where the robot is localised, or in a map that begins with this run."""
-        if self._navigator.task.startswith("route") and self._navigator.drive is not None:
+        if self._task.startswith("route") and self._navigator.drive is not None:
             raise OmnidError("a route is being repeated: stop it first")
         self._require_map()
         if request.name in self._routes and not request.replace:
             again = f"choose another name, or replace it (`omnid route teach {request.name} --replace`)"
             raise OmnidError(f"there is a route {request.name} already: {again}")
         now = self._situation()
-        refusal = refusal_of_map(now, math.inf)
-        if not (self._is_new and now.resets == 0 and now.in_map is not None):
-            _raise_if(refusal)
+        is_begun_here = self._is_new and now.resets == 0 and now.in_map is not None
+        if not is_begun_here and (refusal := refusal_of_map(now, math.inf)):
+            raise OmnidError(refusal)
         self._recorder, self._taught_resets = RouteRecorder(request.name), now.resets
 
     def _record(self, now: Situation) -> None:
@@ -300,12 +302,13 @@ class NavigationStage:
 
     def _pose_in(self, frame: NavigationFrame) -> Array:
         """Return the pose (3,) of the base in a frame. Raise OmnidError where nothing can be driven in it."""
-        _raise_if(refusal_to_drive(self._situation(), frame, self._settings.map_sigma_m))
-        return self._situation().pose_in(frame)
+        situation = self._situation()
+        require_drivable(situation, frame, self._settings.map_sigma_m)
+        return situation.pose_in(frame)
 
     def _situation(self) -> Situation:
         if self._now is None:
-            raise OmnidError(refusal_to_drive(None, NavigationFrame.ODOM, 0.0))
+            raise OmnidError("there is no pose yet: wait until the robot is ready (`omnid listen`)")
         return self._now._replace(in_map=self._in_map, wheels=self._wheels)
 
     def _update(self, now: Navigation, *, always: bool = False) -> NavigationUpdate | None:
@@ -313,7 +316,7 @@ class NavigationStage:
         stamp_ns = 0 if self._now is None else self._now.stamp_ns
         plan, self._plan = self._plan, None
         teaching = recorder.name if recorder else ""
-        state = (now.state, now.reason, navigator.task, teaching, self._taught, answer)
+        state = (now.state, now.reason, self._task, teaching, self._taught, answer)
         same = state == self._published and now.setpoint is None and plan is None
         if same and not always and stamp_ns - self._published_ns < REPEAT_NS:
             return None
@@ -325,8 +328,8 @@ class NavigationStage:
             now.setpoint,
             now.state,
             now.reason,
-            navigator.task,
-            navigator.command_ns,
+            self._task,
+            self._command_ns,
             now.left_m,
             now.offset_m,
             len(drive.paths) if drive else 0,
@@ -349,8 +352,3 @@ def _word(command: NavigationCommand) -> str:
             return f"{action} {name}".strip()
         case verb:
             return str(verb)
-
-
-def _raise_if(refusal: str) -> None:
-    if refusal:
-        raise OmnidError(refusal)

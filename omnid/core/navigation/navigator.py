@@ -24,8 +24,9 @@ from omnid.core.navigation.path import BEGIN, SHORTEST_M, DrivePath, PathPlace, 
 from omnid.core.navigation.planner import Move, Planner, Way
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.situation import UNKNOWN_M, Situation, refusal_of_map, require_drivable
 from omnid.core.navigation.surroundings import Surroundings
+from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import TrackingState
 
@@ -184,8 +185,6 @@ class Navigator:
     drive: Drive | None = None
     state: NavigationState = NavigationState.IDLE
     reason: str = ""
-    task: str = ""  # description of the drive, kept after its end
-    command_ns: int = 0  # stamp of the request for the drive
     _stops: int = field(default=0, init=False)  # number of stops that are still to be sent
     _last_ns: int | None = field(default=None, init=False)
     _planner: Planner = field(init=False)
@@ -199,37 +198,31 @@ class Navigator:
         """True if a stop is to be sent."""
         return self._stops > 0 or (self.drive is not None and bool(self.drive.paused))
 
-    def start(
-        self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
-    ) -> None:
+    def start(self, frame: NavigationFrame, paths: list[DrivePath], now: Situation) -> None:
         """Begin a drive, which replaces the one before."""
         follower, pose = Follower(paths[0], self.settings), now.pose
         self.drive = Drive(frame, paths, follower, now.resets, now.wheels.stop_count, float(pose[2]), pose[:2].copy())
-        self.task, self.command_ns, self._stops = task, command_ns, 0
-        self.state, self.reason = NavigationState.DRIVING, ""
+        self._stops, self.state, self.reason = 0, NavigationState.DRIVING, ""
 
     def cancel(self, reason: str) -> None:
         """End the drive."""
         if self.drive is not None:
             self._end(NavigationState.CANCELLED, reason)
 
-    def pause(self, reason: str) -> str:
-        """Stop until `resume`; return the reason if that is refused, else an empty text."""
+    def pause(self, reason: str) -> None:
+        """Stop until `resume`. Raise OmnidError without a drive."""
         if self.drive is None:
-            return NO_DRIVE
+            raise OmnidError(NO_DRIVE)
         self.drive.paused = self.drive.paused or reason
         self.state, self.reason = NavigationState.PAUSED, self.drive.paused
-        return ""
 
-    def resume(self, now: Situation) -> str:
-        """Continue a paused drive; return the reason if that is refused, else an empty text."""
+    def resume(self, now: Situation) -> None:
+        """Continue a paused drive. Raise OmnidError without one, and where nothing can be driven now."""
         if self.drive is None:
-            return NO_DRIVE
-        refusal = refusal_to_drive(now, NavigationFrame.ODOM, math.inf)
-        if not refusal:
-            self.drive.paused, self.drive.stop_count = "", now.wheels.stop_count
-            self.drive.waited_s = self.drive.stuck_s = 0.0
-        return refusal
+            raise OmnidError(NO_DRIVE)
+        require_drivable(now, NavigationFrame.ODOM, math.inf)
+        self.drive.paused, self.drive.stop_count = "", now.wheels.stop_count
+        self.drive.waited_s = self.drive.stuck_s = 0.0
 
     def step(self, now: Situation) -> Navigation:
         """Return the motion for a new pose, and the state with its reason."""

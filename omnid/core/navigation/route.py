@@ -140,12 +140,19 @@ class RouteRecorder:
 
         Raise OmnidError for one that is too short.
         """
-        if self.length_m < SHORTEST_ROUTE_M:
+        if self._newest is None or self.length_m < SHORTEST_ROUTE_M:
             raise OmnidError(
                 f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
                 "and more: drive it, then finish; `omnid route stop` drops it"
             )
-        poses, speeds, ids, in_keyframe = zip(*self._points_to_end(), strict=True)
+        # The last point is the end of the recording, however near to the point before it.
+        points, last, newest = self._points, self._points[-1], self._newest
+        step = relative(last.pose, newest.pose)
+        if math.hypot(step[0], step[1]) <= 0.5 * SPACING_M or len(points) >= MOST_POINTS:
+            points = [*points[:-1], newest._replace(speed_mps=last.speed_mps)]
+        else:
+            points = [*points, newest._replace(speed_mps=math.copysign(last.speed_mps, step[0]))]
+        poses, speeds, ids, in_keyframe = zip(*points, strict=True)
         route = Route(
             self.name,
             np.array(poses),
@@ -159,16 +166,6 @@ class RouteRecorder:
         return replace(
             route, poses=route.in_map(keyframes).round(DECIMALS), in_keyframe=route.in_keyframe.round(DECIMALS)
         )
-
-    def _points_to_end(self) -> list[RoutePoint]:
-        """Return the points; the last one is the end of the recording, however near to the point before it."""
-        if self._newest is None:
-            return self._points
-        last, newest = self._points[-1], self._newest
-        step = relative(last.pose, newest.pose)
-        if math.hypot(step[0], step[1]) <= 0.5 * SPACING_M or len(self._points) >= MOST_POINTS:
-            return [*self._points[:-1], newest._replace(speed_mps=last.speed_mps)]
-        return [*self._points, newest._replace(speed_mps=math.copysign(last.speed_mps, step[0]))]
 
 
 def repeated_paths(

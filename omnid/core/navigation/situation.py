@@ -11,6 +11,7 @@ from calib.se2_arrays import composed
 from omnid.core.control.control_law import ControllerState
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.surroundings import Surroundings
+from omnid.errors import OmnidError
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -52,18 +53,17 @@ class Situation(NamedTuple):
         return np.asarray(composed(self.T_frame_odom(frame)[None], self.pose)[0])
 
 
-def refusal_to_drive(situation: Situation | None, frame: NavigationFrame, map_sigma_m: float) -> str:
-    """Return why no drive can begin now, with the remedy; empty if it can."""
-    if situation is None:
-        return "there is no pose yet: wait until the robot is ready (`omnid listen`)"
-    wheels = situation.wheels
+def require_drivable(situation: Situation, frame: NavigationFrame, map_sigma_m: float) -> None:
+    """Raise OmnidError with the remedy where nothing can be driven now in a frame."""
+    wheels, refusal = situation.wheels, ""
     if not wheels.armed:
-        return f"not armed ({wheels.disarmed_by}): arm it first (`omnid arm`)"
-    if situation.state is TrackingState.LOST:
-        return "odometry is lost: check the images and the light (`omnid listen`)"
-    if frame is NavigationFrame.MAP:
-        return refusal_of_map(situation, map_sigma_m)
-    return ""
+        refusal = f"not armed ({wheels.disarmed_by}): arm it first (`omnid arm`)"
+    elif situation.state is TrackingState.LOST:
+        refusal = "odometry is lost: check the images and the light (`omnid listen`)"
+    elif frame is NavigationFrame.MAP:
+        refusal = refusal_of_map(situation, map_sigma_m)
+    if refusal:
+        raise OmnidError(refusal)
 
 
 def refusal_of_map(situation: Situation, map_sigma_m: float) -> str:

@@ -39,7 +39,7 @@ class BaseAmongPeople(BaseAmongBoxes):
         self.gap_m, self.contact_mps = math.inf, 0.0  # to the person; forward speed just before a contact ahead
         super().__init__(Navigator(SETTINGS), seed)
         path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
-        self.navigator.start("goal", NavigationFrame.ODOM, [path], self.seen())
+        self.navigator.start(NavigationFrame.ODOM, [path], self.seen())
 
     def where(self) -> Array:
         """Return the place of the person now."""
@@ -179,7 +179,7 @@ class BaseAmongPatches(DrivenBase):
         super().__init__(Navigator(settings), 1)
         self.occupied = occupied
         self.boxes, self.floor, self.around = patches, Floor(), None
-        self.navigator.start("goal", NavigationFrame.ODOM, [path or goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
+        self.navigator.start(NavigationFrame.ODOM, [path or goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
 
     def seen(self) -> Situation:
         now = super().seen()
@@ -227,7 +227,7 @@ def test_the_base_backs_out_where_the_floor_beside_it_is_unknown() -> None:
     """Nose to the end of a dead end whose walls are nearer than the floor in view: only the floor behind was seen."""
     beside = Boxes((-0.6, 0.34, 0.9, 0.5), (-0.6, -0.5, 0.9, -0.34), (0.3, -0.4, 0.9, 0.4))
     base = BaseAmongPatches(beside)
-    base.navigator.start("goal", NavigationFrame.ODOM, [goal_path(base.pose, (-2.0, 1.5))], base.seen())
+    base.navigator.start(NavigationFrame.ODOM, [goal_path(base.pose, (-2.0, 1.5))], base.seen())
     assert base.run(60).state is NavigationState.REACHED
     inside = [sample for sample in base.samples if sample.pose[0] > -0.5]
     assert max(abs(float(sample.pose[2])) for sample in inside) < 0.2

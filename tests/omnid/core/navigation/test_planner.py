@@ -74,7 +74,7 @@ def drive(boxes: Boxes, seed: int, settings: NavigationSettings = SETTINGS, leng
     base = BaseAmongBoxes(Navigator(settings), seed)
     base.boxes = boxes
     path = DrivePath((straight_leg((0.0, 0.0), (length_m, 0.0)),), 0.0)
-    base.navigator.start("goal", NavigationFrame.ODOM, [path], base.seen())
+    base.navigator.start(NavigationFrame.ODOM, [path], base.seen())
     return base
 
 
@@ -153,7 +153,7 @@ def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
     base = BaseAmongBoxes(Navigator(SETTINGS), 6)
     base.boxes = Boxes((2.8, 1.2, 3.2, 1.6))
     path = drive_path([(0.0, 0.0), (3.0, 0.0), (3.0, 3.0)], math.pi / 2)
-    base.navigator.start("path", NavigationFrame.ODOM, [path], base.seen())
+    base.navigator.start(NavigationFrame.ODOM, [path], base.seen())
     assert base.run(90).state is NavigationState.REACHED
     assert clearance_m(base) > 0.02
 
@@ -167,7 +167,7 @@ def to_goal(boxes: Boxes, x_m: float, y_m: float, give_up_s: float = SETTINGS.gi
     """Begin to drive to a goal, by any way."""
     base = BaseAmongBoxes(Navigator(replace(SETTINGS, give_up_s=give_up_s)), 1)
     base.boxes = boxes
-    base.navigator.start("goal", NavigationFrame.ODOM, [goal_path(base.pose, (x_m, y_m), 0.0)], base.seen())
+    base.navigator.start(NavigationFrame.ODOM, [goal_path(base.pose, (x_m, y_m), 0.0)], base.seen())
     return base
 
 

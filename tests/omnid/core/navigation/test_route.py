@@ -125,7 +125,7 @@ def test_a_route_is_repeated_from_anywhere_on_it(start: tuple[float, float, floa
     route = taught(poses, places)
     base = DrivenBase(Navigator(NavigationSettings()), 3, start=start)
     paths = repeated_paths(route, places.keyframes, base.pose, loops=1, reverse=False)
-    base.navigator.start("route hall", NavigationFrame.MAP, paths, base.seen())
+    base.navigator.start(NavigationFrame.MAP, paths, base.seen())
     assert base.run(120).state is NavigationState.REACHED
     away_m, turned_rad = base.error(tuple(route.poses[-1]))
     assert away_m < 0.03 and turned_rad < math.radians(1)
@@ -166,7 +166,7 @@ def test_a_route_is_driven_there_and_back_and_in_rounds() -> None:
     route = taught(poses, places)
     base = DrivenBase(Navigator(NavigationSettings()), 4)
     paths = repeated_paths(route, places.keyframes, base.pose, loops=2, reverse=False)
-    base.navigator.start("route hall", NavigationFrame.MAP, paths, base.seen())
+    base.navigator.start(NavigationFrame.MAP, paths, base.seen())
     assert base.run(120).state is NavigationState.REACHED
     assert math.dist(base.pose[:2], route.poses[0, :2]) < 0.03, "there and back"
     assert max(sample.pose[0] for sample in base.samples) > 3.0
