@@ -111,7 +111,7 @@ class Drive:
             following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
             if following.missed_m is None and following.left_m >= SHORTEST_M:
                 return following
-            self.rejoin(now)
+            self.rejoin(now, self.detour.place)
         following = self.follower.step(now.stamp_ns, now.pose_in(self.frame), *motion)
         heading_rad = following.setpoint.heading_rad
         if heading_rad is None:
@@ -120,9 +120,9 @@ class Drive:
         setpoint = replace(following.setpoint, heading_rad=wrap_angle(heading_rad - turned_rad))
         return following._replace(setpoint=setpoint)
 
-    def rejoin(self, now: Situation) -> None:
-        """Follow the path again, from the place to which the detour leads; to a goal straight on."""
-        path, place = self.paths[0], BEGIN if self.detour is None else self.detour.place
+    def rejoin(self, now: Situation, place: PathPlace) -> None:
+        """Follow the path again, from a place on it; to a goal straight on."""
+        path = self.paths[0]
         if path.is_goal:
             path = goal_path(now.pose_in(self.frame), path.goal, path.final_heading_rad)
         self.detour, self.nearest_m = None, math.inf
@@ -335,7 +335,7 @@ class Navigator:
         if is_to_goal and not is_blocked:
             goal = drive.in_odom(path.goal[None], now)[0]
             if self._planner.is_straight_free(now.pose, goal, around, now.stamp_ns):
-                drive.rejoin(now)
+                drive.rejoin(now, BEGIN)
                 return True
         is_due = is_blocked or (is_to_goal and following.left_m > DOCK_M)
         passed_ns = now.stamp_ns - drive.searched_ns

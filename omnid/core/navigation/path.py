@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -92,16 +91,10 @@ class DrivePath:
         return np.asarray(self.legs[-1].xy[-1])
 
 
-def drive_path(
-    points: ArrayLike,
-    final_heading_rad: float | None = None,
-    *,
-    speeds: ArrayLike | None = None,
-    backwards: Sequence[bool] | None = None,
-) -> DrivePath:
+def drive_path(points: ArrayLike, final_heading_rad: float | None = None, *, speeds: ArrayLike = math.inf) -> DrivePath:
     """Return the path through points (N, 2) [m], in legs that end at corners and where the direction changes.
 
-    speeds: (N,) highest speeds, m/s. backwards: of N points, True where the base came there with its back ahead.
+    speeds: (N,) or of all, highest speeds with which the points are reached, m/s; below 0 with the back ahead.
     Raise OmnidError for points that are no path.
     """
     given = np.asarray(points, np.float64).reshape(-1, 2)
@@ -111,10 +104,9 @@ def drive_path(
         raise OmnidError("a path has positions that are not finite")
     if np.hypot(*np.diff(given, axis=0).T).sum() > MAX_LENGTH_M:
         raise OmnidError(f"a path is longer than {MAX_LENGTH_M:g} m")
-    limits = np.full(len(given), math.inf) if speeds is None else np.asarray(speeds, np.float64)
-    back = np.zeros(len(given), bool) if backwards is None else np.asarray(backwards, bool)
-    kept = _spaced(given, back)
-    xy, limits, back = given[kept], limits[kept], back[kept]
+    limits = np.broadcast_to(np.asarray(speeds, np.float64), len(given))
+    kept = _spaced(given, limits < 0)
+    xy, limits, back = given[kept], np.abs(limits[kept]), limits[kept] < 0
     if len(xy) < 2:
         raise OmnidError(f"a path is shorter than {SHORTEST_M:g} m")
     headings = np.arctan2(*np.diff(xy, axis=0).T[::-1])

@@ -20,7 +20,7 @@ from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.navigation.lattice_kernels import HEADINGS, search, wave_front
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.surroundings import FAR_M, HORIZON_S, MEETING_S, Surroundings, distances_m
+from omnid.core.navigation.surroundings import HORIZON_S, MEETING_S, Surroundings, distances_m
 from omnid.core.obstacles.grid import CELL_M
 
 Array = NDArray[np.float64]
@@ -123,13 +123,14 @@ class Planner:
             # An obstacle seen from afar at the goal may be next to it: drive as near as is free, to see it better.
             least_m = float(away_m[is_open].min())
             if math.dist(goal, pose[:2]) < least_m + LOOK_M:
-                return f"an obstacle is {_nearest_m(goal, around):.1f} m from the goal"
+                return f"an obstacle is {around.closed_distance_m[row, column]:.1f} m from the goal"
             left_s[is_open & (away_m < least_m + 2 * CELL_M)] = 0.0
         elif along is None:
             left_s[is_edge & is_open] = away_m[is_edge & is_open] / velocity_mps
         wave_front(cell_s, left_s)
-        if math.isinf(left_s[round(start[1]), round(start[0])]):
-            return f"an obstacle {_nearest_m(pose[:2], around):.1f} m away closes every way"
+        own = round(start[1]), round(start[0])
+        if math.isinf(left_s[own]):
+            return f"an obstacle {around.closed_distance_m[own]:.1f} m away closes every way"
         # 2. The way, which ends at the edge of the grid if the goal is beyond.
         if not is_inside:
             inner = np.s_[MOVE_CELLS:-MOVE_CELLS, MOVE_CELLS:-MOVE_CELLS]
@@ -151,16 +152,16 @@ class Planner:
         columns, rows = found[1:, :2].round().astype(int).T
         time_s = float(np.maximum(of_moves[:, 2], np.abs(of_moves[:, 0]) * cell_s[rows, columns]).sum())
         moves = of_moves[:, 3] != Move.TURN
-        xy, is_back = np.vstack([pose[None, :2], xy[1:][moves]]), (of_moves[:, 3] == Move.BACK)[moves]
-        is_back = np.append(is_back[:1], is_back) if len(is_back) else np.zeros(1, bool)
+        xy = np.vstack([pose[None, :2], xy[1:][moves]])
+        speeds = np.where(of_moves[moves, 3] == Move.BACK, -BACK_MPS, velocity_mps)
+        speeds = np.append(speeds[:1] if len(speeds) else velocity_mps, speeds)
         if is_free:
-            xy, is_back = np.vstack([xy, goal]), np.append(is_back, False)
+            xy, speeds = np.vstack([xy, goal]), np.append(speeds, velocity_mps)
         else:
             time_s += math.dist(xy[-1], goal) / velocity_mps
         if len(xy) < 2:
             return "the base does not fit through"
-        speeds = np.where(is_back, BACK_MPS, velocity_mps)
-        path = drive_path(xy, speeds=speeds, backwards=[bool(back) for back in is_back])
+        path = drive_path(xy, speeds=speeds)
         return Way(path, time_s, path.length_m + math.dist(path.goal, goal))
 
     def _times(self, start: Array, around: Surroundings, along: Array | None) -> Array:
@@ -185,9 +186,3 @@ class Planner:
             cell_s[distances_m(is_path) > self._settings.corridor_m] = np.inf
         cell_s[own] = CELL_M / pursuit.least_mps
         return cell_s
-
-
-def _nearest_m(place: Array, around: Surroundings) -> float:
-    """Return the distance of a place (2,) from the nearest obstacle; inf without one."""
-    nearest_m = float(around.distance_at(place[None], around.closed_distance_m)[0])
-    return nearest_m if nearest_m < FAR_M else math.inf

@@ -229,10 +229,9 @@ def _nearest(route: Route, poses: Array, pose: Array, away_m: Array) -> int:
 def _path(route: Route, poses: Array, first: int, pose: Array | None = None) -> DrivePath:
     """Return the path from a point of the route on, from the pose of a robot beside it if one is given."""
     first = min(first, len(poses) - 2)
-    xy, speeds = poses[first:, :2], np.maximum(np.abs(route.speeds[first:]), LEAST_MPS)
-    backwards = route.speeds[first:] < 0
+    xy, speeds = poses[first:, :2], route.speeds[first:]
+    speeds = np.where(speeds < 0, -1, 1) * np.maximum(np.abs(speeds), LEAST_MPS)
     if pose is not None:
-        xy = np.vstack([pose[None, :2], xy])
-        speeds, backwards = np.append(speeds[:1], speeds), np.append(backwards[:1], backwards)
-        backwards[:2] = False
-    return drive_path(xy, float(poses[-1, 2]), speeds=speeds, backwards=[bool(b) for b in backwards])
+        xy, speeds = np.vstack([pose[None, :2], xy]), np.append(speeds[:1], speeds)
+        speeds[:2] = np.abs(speeds[:2])
+    return drive_path(xy, float(poses[-1, 2]), speeds=speeds)

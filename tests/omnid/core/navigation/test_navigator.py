@@ -288,7 +288,7 @@ def test_the_base_follows_curves_within_5_cm_and_slows_down_in_them() -> None:
 
 def test_the_base_drives_backwards_where_the_path_was_driven_so() -> None:
     points = [(0.0, 0.0), (2.0, 0.0), (1.0, 0.0)]
-    path = drive_path(points, 0.0, backwards=[False, False, True])
+    path = drive_path(points, 0.0, speeds=[1.0, 1.0, -1.0])
     assert [leg.backwards for leg in path.legs] == [False, True]
     base = DrivenBase(Navigator(NavigationSettings()), 2)
     base.navigator.start(NavigationFrame.ODOM, [path], base.seen())
