@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from calib.boards.board import TAG_BORDER_BITS, AprilGrid, BoardView
+from calib.boards.board import TAG_BORDER_BITS, AprilGrid
 from calib.boards.corner_candidates import Grey, Image, smoothed
 from calib.boards.corner_grid import shown_corners
 from calib.boards.local_mapping import REACH, local_mapping, refined_corners, without_outliers
@@ -27,11 +27,8 @@ MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 MIN_CORNERS = 8
 
 
-def find_april_grid(image: Image, board: AprilGrid, name: str = "") -> BoardView | None:
-    """Find the visible corners of a grid in an image (H, W) uint8; None if there are too few.
-
-    The view's pixels are NaN for corners that are hidden.
-    """
+def find_april_grid(image: Image, board: AprilGrid) -> Array | None:
+    """Return pixels (N, 2) of board.points in an image (H, W) uint8, NaN for hidden ones; None if too few are seen."""
     corners = board.tag_corners / board.tag_m
     tags = _read_tags(image, len(corners))
     if not tags:
@@ -41,7 +38,7 @@ def find_april_grid(image: Image, board: AprilGrid, name: str = "") -> BoardView
     pixels = _grown(smoothed(image), points, places, outlines, board.window)
     # Corners in one line have no mapping, and those of tags that are misread, or of another grid, do not fit to it.
     pixels = without_outliers(points, refined_corners(image, points, pixels, board.window))
-    return BoardView(name, pixels) if np.isfinite(pixels[:, 0]).sum() >= MIN_CORNERS else None
+    return pixels if np.isfinite(pixels[:, 0]).sum() >= MIN_CORNERS else None
 
 
 def _read_tags(image: Image, count: int) -> Tags:

@@ -1,4 +1,4 @@
-"""A checkerboard and a grid of AprilTags, their view in one image, and the shape of its print.
+"""A checkerboard and a grid of AprilTags, and the shape of its print.
 
 Paper curls, a plate gives way, a printer stretches one side. The drawing's points lie in a plane. A print differs from
 it to second order: out of the plane by a quadratic surface, in the plane by the ratio of its sides. mrcal models the
@@ -116,18 +116,6 @@ class AprilGrid:
 
 
 AnyBoard: TypeAlias = Board | AprilGrid
-
-
-@dataclass(frozen=True, slots=True)
-class BoardView:
-    """The corners of a board in one image: pixels (N, 2) in the order of Board.points, NaN for unknown corners.
-
-    The board's x and y axes turn clockwise in the image. The first square is dark where the board's sides (one even,
-    one odd) determine it.
-    """
-
-    name: str
-    pixels: Array
 
 
 MODE_NAMES = ("bend_x", "bend_y", "twist", "stretch")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.boards.board import Board, BoardView
+from calib.boards.board import Board
 from calib.boards.corner_candidates import (
     Grey,
     Image,
@@ -32,8 +32,12 @@ MIN_SCORE = 0.4
 MIN_FILLED = 0.6
 
 
-def find_board(image: Image, board: Board, name: str = "") -> BoardView | None:
-    """Find the board in an image (H, W) uint8, its corners refined to a fraction of a pixel; None if there is none."""
+def find_board(image: Image, board: Board) -> Array | None:
+    """Find the board in an image (H, W) uint8, its corners refined to a fraction of a pixel; None if there is none.
+
+    Returns pixels (N, 2) in the order of board.points, NaN for unknown corners. The board's x and y axes turn clockwise
+    in the image. The first square is dark where the board's sides (one even, one odd) determine it.
+    """
     blurred, points = smoothed(image), board.points[:, :2] / board.square_m
     for grid in _grids(image, board):
         # 1. Grow the grid by corners of the image itself.
@@ -45,7 +49,7 @@ def find_board(image: Image, board: Board, name: str = "") -> BoardView | None:
         corners = without_outliers(points, refined_corners(image, points, placed.reshape(-1, 2)))
         # 3. Accept it by its score.
         if _is_whole(corners.reshape(placed.shape)) and board_score(blurred, corners, board) >= MIN_SCORE:
-            return BoardView(name, corners)
+            return corners
     return None
 
 

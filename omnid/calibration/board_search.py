@@ -9,8 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from calib.boards.aprilgrid import find_april_grid
-from calib.boards.board import AnyBoard, AprilGrid, Board, BoardView
+from calib.boards.board import AnyBoard, AprilGrid, Board
 from calib.boards.checkerboard import find_board
+from calib.models.camera import Array
 from calib.models.ocam import View
 from calib.validation import silent
 from omnid.calibration.images import Image, Images
@@ -27,22 +28,21 @@ def require_one_orientation(board: AnyBoard) -> None:
         )
 
 
-def search_board(image: Image, board: AnyBoard, name: str = "") -> BoardView | None:
-    """Search a board of any kind in an image; name: of the view that is found."""
-    return find_board(image, board, name) if isinstance(board, Board) else find_april_grid(image, board, name)
+def search_board(image: Image, board: AnyBoard) -> Array | None:
+    """Return pixels (N, 2) of the corners of a board of any kind in an image, NaN for unknown ones; None: no board."""
+    return find_board(image, board) if isinstance(board, Board) else find_april_grid(image, board)
 
 
-def find_boards(images: Images, board: AnyBoard, progress: Progress = silent) -> list[BoardView]:
-    """Find the views of a board in images, on all cores; raises OmnidError if there is none."""
-    views = list[BoardView]()
+def find_boards(images: Images, board: AnyBoard, progress: Progress = silent) -> dict[str, Array]:
+    """Return the corners (N, 2) [px] by the names of the images that show a board; OmnidError if there is none."""
+    views = dict[str, Array]()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        searches = pool.map(lambda name: search_board(images[name], board, name), images)
+        searches = pool.map(lambda image: search_board(image, board), images.values())
         for number, (name, view) in enumerate(zip(images, searches, strict=True), 1):
             outcome = "no board"
             if view is not None:
-                views.append(view)
-                corners = view.pixels[:, 0]
-                outcome = f"board found, {np.isfinite(corners).sum()} of {len(corners)} corners"
+                views[name] = view
+                outcome = f"board found, {np.isfinite(view[:, 0]).sum()} of {len(view)} corners"
             progress(f"[{number}/{len(images)}] {name}: {outcome}")
     if not views:
         raise OmnidError(
@@ -52,14 +52,14 @@ def find_boards(images: Images, board: AnyBoard, progress: Progress = silent) ->
     return views
 
 
-def view_of_tags(stated: View | None, views: Sequence[BoardView], board: AprilGrid) -> View:
+def view_of_tags(stated: View | None, views: Sequence[Array], board: AprilGrid) -> View:
     """Return the view of cameras that the tags of a grid show; OmnidError where another one is stated."""
     # The grid's y points up in an image that is not reflected, the pixels' v down.
     reflected = []
     for view in views:
-        seen = np.isfinite(view.pixels[:, 0])
+        seen = np.isfinite(view[:, 0])
         known = np.column_stack([board.points[seen, :2], np.ones(seen.sum())])
-        affine = np.linalg.lstsq(known, view.pixels[seen], rcond=None)[0]
+        affine = np.linalg.lstsq(known, view[seen], rcond=None)[0]
         reflected.append(np.linalg.det(affine[:2]) > 0)
     found: View = "mirror" if np.mean(reflected) > 0.5 else "direct"
     if stated not in (None, found):

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.boards.board import AnyBoard, BoardView
+from calib.boards.board import AnyBoard
 from calib.models.camera import Array
 from calib.rig import SIDES
 from drivers.errors import FrameDecodeError
@@ -30,7 +30,7 @@ NEEDED_PAIRS: Final = 15
 # Two positions of a board differ if their corners are this far apart on average, as a fraction of the disc's radius.
 NEW_VIEW_PART: Final = 0.06
 STILL_PART: Final = 0.004  # a board that is held still moves less between two images
-Views = tuple[BoardView | None, BoardView | None]
+Views = tuple[Array | None, Array | None]  # corners (N, 2) [px], see find_board
 
 
 class CameraCoverage:
@@ -70,11 +70,11 @@ def hours_of(offset: Array) -> NDArray[np.int64]:
     return np.round(clockwise * HOURS).astype(np.int64) % HOURS
 
 
-def moved(a: BoardView | None, b: BoardView | None) -> float:
+def moved(a: Array | None, b: Array | None) -> float:
     """Return the mean distance of the corners that both views have, px; inf where they have none."""
     if a is None or b is None:
         return math.inf
-    distance = np.linalg.norm(a.pixels - b.pixels, axis=1)
+    distance = np.linalg.norm(a - b, axis=1)
     known = distance[np.isfinite(distance)]
     return float(known.mean()) if known.size else math.inf
 
@@ -95,7 +95,7 @@ class LiveBoards:
     def __init__(self, board: AnyBoard) -> None:
         self._board = board
         self._before: Views = (None, None)
-        self._kept: list[tuple[BoardView, BoardView]] = []
+        self._kept: list[tuple[Array, Array]] = []
         self.coverage: tuple[CameraCoverage, ...] = ()  # of both cameras after the first pair of images
         self._pool = ThreadPoolExecutor(len(SIDES))
 
@@ -134,7 +134,7 @@ class LiveBoards:
         # 3. Keep the pair, and count what it covers.
         self._kept.append((lower, upper))
         for coverage, view in zip(self.coverage, (lower, upper), strict=True):
-            coverage.add(view.pixels)
+            coverage.add(view)
         return PairOutcome.KEPT
 
     def close(self) -> None:

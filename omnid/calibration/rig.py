@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.boards.board import AnyBoard, AprilGrid, Board, BoardView
+from calib.boards.board import AnyBoard, AprilGrid, Board
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.rig_uncertainty import drive_uncertainty
+from calib.models.camera import Array
 from calib.models.names import sees_directly
 from calib.models.ocam import View
 from calib.rig import SIDES, Rig, mounting_notes, rig_between
@@ -62,7 +63,7 @@ class RigResult:
         """Return the shape of the print, and the tables of residuals by the angle from the axis, in lines."""
         found = self.calibration
         angles = [line for side in range(len(SIDES)) for line in angle_lines(SIDES[side], angle_rows(found, side))]
-        return [found.shape.described(found.board.points), *angles]
+        return [found.fit.rig.shape.described(found.board.points), *angles]
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the rig.toml."""
@@ -118,15 +119,14 @@ def calibrate_rig(
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
     """Find the board in the images of both cameras."""
-    found = list[dict[str, BoardView]]()
+    found = list[dict[str, Array]]()
     for name, side in zip(SIDES, images.sides, strict=True):
         try:
-            views = find_boards(side, board, progress)
+            found.append(find_boards(side, board, progress))
         except OmnidError as error:
             raise OmnidError(f"{name} camera: {error}") from error
-        found.append({view.name: view for view in views})
     seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names]
-    return [view for view in seen if any(view.seen)]
+    return [view for view in seen if view.is_seen]
 
 
 def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float) -> None:

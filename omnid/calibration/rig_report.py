@@ -43,8 +43,8 @@ def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
     views = [(k, view.name, seen) for k, view in enumerate(found.views) if (seen := view.seen[side]) is not None]
     image = images.sides[side][views[0][1]]
     canvas = cv2.cvtColor(image // 2, cv2.COLOR_GRAY2BGR)
-    for k, _, seen in views:
-        starts, arrows = seen.pixels, ARROW * found.fit.residuals[k, side]
+    for k, _, starts in views:
+        arrows = ARROW * found.fit.residuals[k, side]
         known = np.isfinite(starts + arrows).all(axis=1)
         for start, end in np.rint([starts[known], (starts + arrows)[known]]).astype(int).swapaxes(0, 1).tolist():
             cv2.circle(canvas, start, 3, GREEN, 1, cv2.LINE_AA)
@@ -65,7 +65,7 @@ def angle_rows(found: RigCalibration, side: int) -> list[Row]:
     The rms is that of a coordinate.
     """
     camera = found.cameras[side]
-    seen = [(k, view.pixels) for k, pair in enumerate(found.views) if (view := pair.seen[side]) is not None]
+    seen = [(k, view) for k, pair in enumerate(found.views) if (view := pair.seen[side]) is not None]
     residuals = np.concatenate([found.fit.residuals[k, side] for k, _ in seen])
     rays, axis = camera.lift(np.concatenate([pixels for _, pixels in seen])), camera.lift(np.array([camera.center]))[0]
     angle_deg = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=1), rays @ axis))

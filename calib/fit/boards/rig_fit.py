@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import AS_DRAWN, AnyBoard, BoardView, PrintShape
+from calib.boards.board import AS_DRAWN, AnyBoard, PrintShape
 from calib.boards.local_mapping import refine_with_camera
 from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
@@ -34,10 +34,18 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class PairView:
-    """The views of a board at one instant by each camera; None: a camera does not see it."""
+    """The views of a board at one instant by each camera; None: a camera does not see it.
+
+    A view is the pixels (N, 2) of the corners in the order of the board's points, NaN for unknown ones.
+    """
 
     name: str
-    seen: tuple[BoardView | None, ...]
+    seen: tuple[Array | None, ...]
+
+    @property
+    def is_seen(self) -> bool:
+        """True if a camera sees the board."""
+        return any(view is not None for view in self.seen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +98,6 @@ class RigCalibration:
         return float(np.sqrt(along @ self.motion_covariance[:3, :3] @ along))
 
     @property
-    def shape(self) -> PrintShape:
-        """Return the shape of the print."""
-        return self.fit.rig.shape
-
-    @property
     def pairs(self) -> int:
         """Return the number of instants at which all cameras saw the board."""
         return _pairs(self.views)
@@ -127,8 +130,8 @@ def calibrate_boards(
         where = f"{SIDES[side]} camera: " if len(sizes) > 1 else ""
         rejected += [RejectedView(bad.name, where + bad.reason) for bad in found.rejected]
         bad_names = {bad.name for bad in found.rejected}
-        views = [_with(one, side, None) if one.name in bad_names else one for one in views]
-        views = [one for one in views if any(one.seen)]
+        views = [_without(one, side) if one.name in bad_names else one for one in views]
+        views = [one for one in views if one.is_seen]
     # 2. The transform between the cameras, and all together.
     if len(sizes) == 1:
         found = replace(alone[0], rejected=())
@@ -153,12 +156,12 @@ def refined_views(found: RigCalibration, images: Sequence[Images]) -> list[PairV
     """Return the views with their corners moved onto those of the images, by the calibrated cameras."""
     poses = found.fit.rig.transforms()
 
-    def refined(k: int, side: int) -> BoardView | None:
-        seen = found.views[k].seen[side]
-        if seen is None:
+    def refined(k: int, side: int) -> Array | None:
+        view, camera = found.views[k], found.cameras[side]
+        pixels = view.seen[side]
+        if pixels is None:
             return None
-        image, camera = images[side][seen.name], found.cameras[side]
-        return replace(seen, pixels=refine_with_camera(image, seen.pixels, found.board, camera, poses[side][k]))
+        return refine_with_camera(images[side][view.name], pixels, found.board, camera, poses[side][k])
 
     return [
         PairView(view.name, tuple(refined(k, side) for side in range(len(view.seen))))
@@ -216,7 +219,7 @@ def _fit_pair(views: Sequence[PairView], board: AnyBoard, alone: Sequence[RigCal
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
     good = [views[k] for k in initial.T_lower_board]
     _require(_pairs(good), "consistent pairs of views", rejected)
-    shape = PrintShape(tuple(np.mean([one.shape.values for one in alone], axis=0).tolist()))
+    shape = PrintShape(tuple(np.mean([one.fit.rig.shape.values for one in alone], axis=0).tolist()))
     start = BoardRig(cameras, initial.T_upper_lower, np.array([*initial.T_lower_board.values()]), shape, np.zeros(2))
     found = _without_outliers(start, good, board)
     if found.fit.mean_px > MAX_MEAN_PX:
@@ -249,17 +252,17 @@ def _without_outliers(start: BoardRig, views: Sequence[PairView], board: AnyBoar
 def _pixels(views: Sequence[PairView], board: AnyBoard) -> Array:
     """Return the corners (K, C, N, 2) of views, NaN for those that a camera does not see."""
     none = np.full((len(board.points), 2), np.nan)
-    return np.array([[none if seen is None else seen.pixels for seen in view.seen] for view in views])
+    return np.array([[none if seen is None else seen for seen in view.seen] for view in views])
 
 
 def _pairs(views: Sequence[PairView]) -> int:
     """Return the number of instants at which all cameras saw the board."""
-    return sum(None not in view.seen for view in views)
+    return sum(all(seen is not None for seen in view.seen) for view in views)
 
 
-def _with(view: PairView, side: int, seen: BoardView | None) -> PairView:
-    """Return the views of an instant with another one of a camera."""
-    return replace(view, seen=tuple(seen if k == side else own for k, own in enumerate(view.seen)))
+def _without(view: PairView, side: int) -> PairView:
+    """Return the views of an instant without that of a camera."""
+    return replace(view, seen=tuple(None if k == side else own for k, own in enumerate(view.seen)))
 
 
 def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:

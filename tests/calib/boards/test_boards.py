@@ -59,9 +59,9 @@ def errors_px(found: Array, truth: Array) -> Array:
 def test_finds_boards_on_all_sides(sensor: Sensor, contrast: tuple[float, float], limit_px: float) -> None:
     for seed, T in enumerate(poses(3)):
         rendered = RENDERER.render_board(T, seed=seed, sensor=sensor, contrast=contrast)
-        view = find_board(rendered.image, BOARD, "x")
-        assert view is not None and np.isfinite(view.pixels).mean() > 0.7, seed
-        off = errors_px(view.pixels, rendered.corners)
+        view = find_board(rendered.image, BOARD)
+        assert view is not None and np.isfinite(view).mean() > 0.7, seed
+        off = errors_px(view, rendered.corners)
         assert np.nanmedian(off) < limit_px / 2 and np.nanpercentile(off, 90) < limit_px, seed
 
 
@@ -72,7 +72,7 @@ def test_finds_a_board_through_a_fisheye_lens() -> None:
     rendered = BoardRenderer.of(BOARD, camera, mask).render_board(T)
     view = find_board(rendered.image, BOARD)
     assert view is not None
-    assert np.nanmax(errors_px(view.pixels, rendered.corners)) < 0.2
+    assert np.nanmax(errors_px(view, rendered.corners)) < 0.2
 
 
 def test_corner_order_is_clockwise_and_starts_at_a_dark_square() -> None:
@@ -80,7 +80,7 @@ def test_corner_order_is_clockwise_and_starts_at_a_dark_square() -> None:
         rendered = RENDERER.render_board(T, seed=seed)
         view = find_board(rendered.image, BOARD)
         assert view is not None
-        grid = view.pixels.reshape(BOARD.rows, BOARD.columns, 2)
+        grid = view.reshape(BOARD.rows, BOARD.columns, 2)
         along, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         assert (along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0] > 0).all()
         first, second = (grid[:2, i : i + 2].mean(axis=(0, 1)).round().astype(int) for i in (0, 1))
@@ -118,7 +118,7 @@ def test_finds_the_board_in_all_ten_real_images(shared_data: Path) -> None:
     for number in range(10):
         image = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)
         view = find_board(image.astype(np.uint8), Board(6, 7, 0.03))
-        assert view is not None and np.isfinite(view.pixels).all(), number
+        assert view is not None and np.isfinite(view).all(), number
 
 
 def test_finds_a_board_whose_outer_squares_are_cut_off_by_the_image() -> None:
@@ -126,10 +126,10 @@ def test_finds_a_board_whose_outer_squares_are_cut_off_by_the_image() -> None:
     cut = round(3 * SQUARE_PX * 1.65)
     image = np.asarray(cv2.GaussianBlur(sheet[cut:-cut, cut:-cut], (0, 0), 1.0), np.uint8)
     view = find_board(image, BOARD)
-    assert view is not None and np.isfinite(view.pixels).mean() > 0.9
+    assert view is not None and np.isfinite(view).mean() > 0.9
     x, y = np.meshgrid(np.arange(6), np.arange(5))
     truth = np.asarray(3 * SQUARE_PX * (np.column_stack([x.ravel(), y.ravel()]) + 2.0) - 0.5 - cut, float)
-    assert np.nanmax(errors_px(view.pixels, truth)) < 0.3
+    assert np.nanmax(errors_px(view, truth)) < 0.3
 
 
 # AprilTag grids
@@ -144,9 +144,9 @@ GRID = AprilGrid(4, 3, 0.06, 0.3)
 def test_finds_the_visible_corners_in_a_mirror(hidden: float, least: float, most: float) -> None:
     T = board_poses_around_camera(MOUNTED.camera, frame_board(GRID), GRID_MASK, 1, seed=3, distance_m=(0.25, 0.3))[0]
     made = render_april_grid(MOUNTED, GRID, T, seed=1, sensor=Sensor(noise_sigma=2.0), hidden=hidden)
-    view = find_april_grid(made.image, GRID, "name")
-    assert view is not None and view.name == "name" and least <= np.isfinite(view.pixels[:, 0]).mean() <= most
-    off = np.linalg.norm(view.pixels - made.corners, axis=1)
+    view = find_april_grid(made.image, GRID)
+    assert view is not None and least <= np.isfinite(view[:, 0]).mean() <= most
+    off = np.linalg.norm(view - made.corners, axis=1)
     assert np.nanmedian(off) < 0.05 and np.nanpercentile(off, 90) < 0.3
 
 

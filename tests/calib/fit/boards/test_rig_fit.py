@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape
+from calib.boards.board import AS_DRAWN, Board, PrintShape
 from calib.boards.checkerboard import find_board
 from calib.errors import CalibError
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards
@@ -47,7 +47,7 @@ def pairs(
     rng, made, points = np.random.default_rng(seed), [], shape.points(board.points)
     for k, T in enumerate(board_poses_around_rig(RIG, board, count, seed=seed)):
         both = [m.camera.project(se3.apply(m.T_cam_rig @ T, points)) for m in (RIG.lower, RIG.upper)]
-        lower, upper = (BoardView(f"p{k}", pixels + noise_px * rng.standard_normal(pixels.shape)) for pixels in both)
+        lower, upper = (pixels + noise_px * rng.standard_normal(pixels.shape) for pixels in both)
         made.append(PairView(f"p{k}", (lower, upper)))
     return made
 
@@ -80,8 +80,7 @@ def one_sided(camera: OmniCamera, noise_px: float = 0.0, seed: int = 0) -> list[
     )
     rng, seen = np.random.default_rng(seed), [camera.project(se3.apply(T, ODD.points)) for T in poses]
     return [
-        PairView(f"view{k}", (BoardView(f"view{k}", pixels + noise_px * rng.standard_normal(pixels.shape)),))
-        for k, pixels in enumerate(seen)
+        PairView(f"view{k}", (pixels + noise_px * rng.standard_normal(pixels.shape),)) for k, pixels in enumerate(seen)
     ]
 
 
@@ -127,8 +126,8 @@ def test_views_that_do_not_fit_are_rejected_by_name() -> None:
     views[3] = replace(views[3], seen=(lower, views[4].seen[1]))
     rng = np.random.default_rng(1)
     lower, upper = views[6].seen
-    assert lower
-    views[6] = replace(views[6], seen=(replace(lower, pixels=rng.uniform(100, 600, lower.pixels.shape)), upper))
+    assert lower is not None
+    views[6] = replace(views[6], seen=(rng.uniform(100, 600, lower.shape), upper))
     found = calibrated(views)
     reasons = {bad.name: bad.reason for bad in found.rejected}
     assert sorted(reasons) == ["p3", "p6"] and "was the board moving?" in reasons["p3"]
@@ -155,8 +154,8 @@ def test_refuses_too_few_views_and_pairs() -> None:
 )
 def test_the_shape_of_the_print_is_found_and_leaves_the_rig_as_it_is(shape: PrintShape) -> None:
     found = calibrated(pairs(ODD, 14, 0.01, shape=shape))
-    np.testing.assert_allclose(found.shape.values[:3], shape.values[:3], atol=4e-5)
-    assert found.shape.stretch == pytest.approx(shape.stretch, abs=4 * np.sqrt(found.fit.covariance[-1, -1]))
+    np.testing.assert_allclose(found.fit.rig.shape.values[:3], shape.values[:3], atol=4e-5)
+    assert found.fit.rig.shape.stretch == pytest.approx(shape.stretch, abs=4 * np.sqrt(found.fit.covariance[-1, -1]))
     assert found.fit.mean_px < 0.014 and off(found)[0] < 0.02 and off(found)[1] < 0.3
 
 
@@ -173,29 +172,24 @@ def read_images(shared_data: Path) -> Images:
     return {path.name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint8) for path in paths}
 
 
-def reference(shared_data: Path, key: str) -> tuple[dict[str, Any], list[BoardView], Array]:
+def reference(shared_data: Path, key: str) -> tuple[dict[str, Any], list[PairView], Array]:
     """Return OCamCalib's numbers, its corners as views, and its errors by image."""
     numbers = json.loads((shared_data / "vmr_board" / "reference.json").read_text())[key]
-    views = [
-        BoardView(entry["image"], np.column_stack([entry["col_1based"], entry["row_1based"]]) - 1.0)
-        for entry in numbers["images"]
-    ]
     # From the toolbox's order of corners to Board.points: x varies fastest.
     order = np.lexsort((numbers["Xt_mm"], numbers["Yt_mm"]))
-    reordered = [BoardView(view.name, view.pixels[order]) for view in views]
-    return numbers, reordered, np.array(numbers["stored_errMean_px"])
-
-
-def of_one_camera(views: list[BoardView]) -> list[PairView]:
-    return [PairView(view.name, (view,)) for view in views]
+    views = [
+        PairView(entry["image"], (np.column_stack([entry["col_1based"], entry["row_1based"]])[order] - 1.0,))
+        for entry in numbers["images"]
+    ]
+    return numbers, views, np.array(numbers["stored_errMean_px"])
 
 
 @pytest.mark.slow
 def test_a_real_mirror_is_fitted_to_a_quarter_of_a_pixel(shared_data: Path) -> None:
     images = read_images(shared_data)
-    views = [view for name, image in images.items() if (view := find_board(image, BOARD, name)) is not None]
-    assert len(views) == 10
-    found = calibrate_boards(of_one_camera(views), BOARD, [REAL_SIZE], "mirror", [images])
+    views = [PairView(name, (find_board(image, BOARD),)) for name, image in images.items()]
+    assert len(views) == 10 and all(view.is_seen for view in views)
+    found = calibrate_boards(views, BOARD, [REAL_SIZE], "mirror", [images])
     assert found.rejected == () and found.fit.mean_px < 0.25
 
 
@@ -207,7 +201,7 @@ def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(
     shared_data: Path, key: str, mean_px: float, apart_deg: float
 ) -> None:
     numbers, views, errors = reference(shared_data, key)
-    found = calibrate_boards(of_one_camera(views), BOARD, [REAL_SIZE])
+    found = calibrate_boards(views, BOARD, [REAL_SIZE])
     assert found.fit.mean_px < mean_px < numbers["stored_mean_err_px"]
     assert (np.nanmean(found.fit.errors_px[:, 0], axis=1) < errors * 1.15).all()
     row, column = found.cameras[0].center_row_column
