@@ -196,14 +196,6 @@ def example(name: str, *words: object, cwd: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, check=True).stdout
 
 
-def test_the_example_of_a_replay_runs(tmp_path: Path, scene: Path, result: omnid.RunResult) -> None:
-    out = example("replay_log", scene / "log.mcap", scene / "rig.toml", cwd=tmp_path)
-    assert out.startswith(f"{PAIRS} poses, {result.counters.length_m:.2f} m")
-    result.save_tum(tmp_path / "expected.tum")
-    assert (tmp_path / "trajectory.tum").read_bytes() == (tmp_path / "expected.tum").read_bytes()
-    assert (tmp_path / "map.ply").stat().st_size > 1000
-
-
 def test_the_example_of_images_runs(tmp_path: Path, scene: Path, pairs: list[Pair], result: omnid.RunResult) -> None:
     for name, index in (("lower", 1), ("upper", 2)):
         (tmp_path / name).mkdir()
