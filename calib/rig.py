@@ -182,6 +182,14 @@ class Rig:
         T_upper_rig = se3.inverse(se3.transform(R_rig_upper, viewpoint))
         return replace(self, upper=replace(self.upper, T_cam_rig=T_upper_rig))
 
+    def moves_to(self, other: Rig) -> Array:
+        """Return the moves (6,) in the order of TRANSFORM_NAMES by which with_upper_moved leads to another rig."""
+        R_rect_rig = se3.R_of(self.T_rect_rig)
+        R_rig_upper, own = se3.R_of(other.upper.T_cam_rig).T, se3.R_of(self.upper.T_cam_rig)
+        turn = se3.rotation_log(R_rect_rig @ R_rig_upper @ own @ R_rect_rig.T)
+        x, y, z = R_rect_rig @ (other.upper.viewpoint - other.lower.viewpoint)
+        return np.array([*turn, x / z, y / z, other.baseline_m - self.baseline_m])
+
     @property
     def T_rect_rig(self) -> Array:
         """Return T_rect_rig (4, 4): origin in the lower viewpoint, z towards the upper one, x nearest the rig's x.

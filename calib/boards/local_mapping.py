@@ -101,8 +101,9 @@ def predicted_corners(grey: Grey, mappings: Sequence[LocalMapping], window: floa
 
     window: half side [squares]; a corner is not sought farther than that.
     """
-    shift = _corner_shifts(grey, _to_image(mappings), np.zeros((len(mappings), 2)), window)
-    pixels = _to_image(mappings)(np.arange(len(mappings)), shift[:, None])[:, 0]
+    to_image = _to_image(mappings)
+    shift = _corner_shifts(grey, to_image, len(mappings), window)
+    pixels = to_image(np.arange(len(mappings)), shift[:, None])[:, 0]
     return pixels, np.abs(shift).max(axis=1)
 
 
@@ -164,7 +165,7 @@ def refine_with_camera(
         at = points[which, None] + board.square_m * np.concatenate([xy, np.zeros((*xy.shape[:2], 1))], axis=2)
         return camera.project_near(se3.apply(T_cam_board, at.reshape(-1, 3))).reshape(xy.shape)
 
-    shift = _corner_shifts(image.astype(np.float32), to_image, np.zeros((len(seen), 2)), board.window)
+    shift = _corner_shifts(image.astype(np.float32), to_image, len(seen), board.window)
     refined = pixels.copy()
     refined[seen] = to_image(np.arange(len(seen)), shift[:, None])[:, 0]
     return refined
@@ -176,18 +177,18 @@ def _to_image(mappings: Sequence[LocalMapping]) -> ToImage:
     return lambda which, xy: np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ own[which])
 
 
-def _corner_shifts(grey: Grey, to_image: ToImage, start: Array, window: float) -> Array:
-    """Return the shifts (M, 2) [squares] of corners to those of the image, by repeated steps from a start.
+def _corner_shifts(grey: Grey, to_image: ToImage, count: int, window: float) -> Array:
+    """Return the shifts (count, 2) [squares] of corners to those of the image, by repeated steps.
 
-    It is the start for those that leave the window: they have reached another edge.
+    It is 0 for those that leave the window: they have reached another edge.
     """
-    shift = start
+    shift = np.zeros((count, 2))
     for _ in range(MAX_ITERATIONS):
         step = _corner_offsets(grey, to_image, shift, window)
         shift = shift + step
         if not (np.abs(step) * _squares_px(to_image, shift, window)[:, None] > CONVERGED_PX).any():
             break
-    return np.where(np.abs(shift - start).max(axis=1, keepdims=True) < window, shift, start)
+    return np.where(np.abs(shift).max(axis=1, keepdims=True) < window, shift, 0.0)
 
 
 def _squares_px(to_image: ToImage, shift: Array, window: float) -> Array:

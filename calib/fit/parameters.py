@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 
-from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 from calib.models.names import changed, is_coefficient, values_of
@@ -187,12 +186,8 @@ class RigParameters:
 
     def transform_steps(self, rig: Rig) -> Array:
         """Return the steps (P,) that give this rig the transform between the cameras of another; all others are 0."""
-        R_rect_rig = se3.R_of(self.rig.T_rect_rig)
-        R_rig_upper, own = se3.R_of(rig.upper.T_cam_rig).T, se3.R_of(self.rig.upper.T_cam_rig)
-        turn = se3.rotation_log(R_rect_rig @ R_rig_upper @ own @ R_rect_rig.T)
-        x, y, z = R_rect_rig @ (rig.upper.viewpoint - rig.lower.viewpoint)
         steps = np.zeros(len(self.names))
-        steps[self.of_transform] = np.array([*turn, x / z, y / z]) / ANGLE_UNIT_RAD
+        steps[self.of_transform] = self.rig.moves_to(rig)[: len(TRANSFORM_NAMES)] / ANGLE_UNIT_RAD
         return steps
 
     def baseline(self, change: Array, covariance: Array) -> tuple[float, Array]:

@@ -8,7 +8,6 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.fit.least_squares import ROUNDS
 from calib.fit.parameters import TIMES, RigParameters
@@ -20,6 +19,7 @@ from calib.fit.rig_from_drive import (
     observation_sigma,
 )
 from calib.fit.rig_uncertainty import drive_uncertainty
+from calib.models.camera import Array
 from calib.models.ocam import has_wavefront
 from calib.rig import Rig, RigCovariance
 from calib.rig_file import read_rig
@@ -28,11 +28,8 @@ from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import Progress
 from omnid.calibration.drive_observations import collect
 from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
-from omnid.config import Config
 from omnid.core.rig.rig_health import SIGMAS
 from omnid.errors import OmnidError
-
-Array = NDArray[np.float64]
 
 # Distortion terms of omni cameras that are fitted although the file has none: a camera may be tilted below its mirror.
 DISTORTION = ("p1", "p2")
@@ -72,7 +69,7 @@ def calibrate_drive(
 
     topics: of the lower and the upper camera. progress receives one line for each round.
     """
-    log, rig, config = Path(log), rig if isinstance(rig, Rig) else read_rig(Path(rig)), Config()
+    log, rig = Path(log), rig if isinstance(rig, Rig) else read_rig(Path(rig))
     # 1. Find the rims of the mirrors, and start with tangential terms and times of exposure. Wavefronts are parameters
     #    if boards have shown them: a drive alone shows them as well, but the central cameras that remain measured the
     #    lengths of other drives less well.
@@ -81,13 +78,13 @@ def calibrate_drive(
     waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
     parameters = RigParameters.about(before, DISTORTION, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
-    steps = straightened(log, parameters, cameras, config, progress)
+    steps = straightened(log, parameters, cameras, progress)
     require_same_rig(parameters, steps)
     # 3. Track and adjust: each round tracks in panoramas of the rig of the one before, the first one in those of a rig
     #    that is hardly known.
     correlated = 1.0 if before.covariance is None else CORRELATED_OBSERVATIONS
     for number in range(1 + ROUNDS):
-        state, observations = collect(log, parameters.at(steps), cameras, config)
+        state, observations = collect(log, parameters.at(steps), cameras)
         found = adjust_drive(parameters, replace(state, steps=steps), observations, correlated=correlated)
         steps = found.state.steps
         progress(
@@ -101,12 +98,10 @@ def calibrate_drive(
     return DriveCalibration(_finished_rig(before, found), found, first_sigma_px)
 
 
-def straightened(
-    log: Path, parameters: RigParameters, cameras: LogCameras, config: Config, progress: Progress
-) -> Array:
+def straightened(log: Path, parameters: RigParameters, cameras: LogCameras, progress: Progress) -> Array:
     """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
     rig = parameters.rig
-    finding = check_rig(read_rig_pairs(log, rig, cameras), rig, config.panorama).finding
+    finding = check_rig(read_rig_pairs(log, rig, cameras), rig).finding
     progress(finding.summary)
     if finding.drift is None:
         raise OmnidError(

@@ -7,10 +7,10 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib import se3
 from calib.fit.rig_from_drive import DriveObservations, DriveState
+from calib.models.camera import Array
 from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.config import Config
@@ -22,18 +22,17 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.tracking_state import TrackingState
 
-Array = NDArray[np.float64]
-
 KEYFRAME_M, KEYFRAME_RAD = 0.12, np.deg2rad(8)
 MAX_KEYFRAMES = 80  # On long drives they are farther apart.
 MIN_KEYFRAMES = 15
 
 
-def collect(log: Path, rig: Rig, cameras: LogCameras, config: Config) -> tuple[DriveState, DriveObservations]:
+def collect(log: Path, rig: Rig, cameras: LogCameras) -> tuple[DriveState, DriveObservations]:
     """Return keyframes of a drive with its landmarks, without steps of the rig, and their pixels in the images.
 
     OmnidError where it is too short.
     """
+    config = Config()
     place = geometry(rig, config.panorama)
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
     landmarks = DriveLandmarks(place.model(config.odometry.noise_px))

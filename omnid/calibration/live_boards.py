@@ -18,7 +18,7 @@ from calib.models.camera import Array
 from calib.rig import SIDES
 from drivers.errors import FrameDecodeError
 from drivers.frame import FrameSource, gray
-from omnid.calibration.board_search import search_board
+from omnid.calibration.board_search import require_one_orientation, search_board
 from omnid.calibration.images import Image
 from omnid.errors import OmnidError
 from omnid.transport.codec import DiagnosticStatus
@@ -93,6 +93,7 @@ class LiveBoards:
     """Takes pairs of images one after the other; keeps those that add information."""
 
     def __init__(self, board: AnyBoard) -> None:
+        require_one_orientation(board)
         self._board = board
         self._before: Views = (None, None)
         self._kept: list[tuple[Array, Array]] = []

@@ -132,7 +132,7 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> li
 def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float) -> None:
     """Raise OmnidError if the baseline is far from the expected one."""
     if abs(found.baseline_m / expected_m - 1) > REFUSED_PART:
-        length_mm = 1e3 * (board.tag_m if isinstance(board, AprilGrid) else board.square_m)
+        length_mm = 1e3 * board.square_m
         raise OmnidError(
             f"calibrate rig: expected a baseline of {1e3 * expected_m:g} mm, found {1e3 * found.baseline_m:.1f} mm; "
             f"squares or tags of {length_mm * expected_m / found.baseline_m:.2f} mm would explain it: measure the "

@@ -13,7 +13,7 @@ import numpy as np
 from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import TOLERANCE_NS, spread_pairs
-from omnid.config import Config, PanoramaConfig
+from omnid.config import PanoramaConfig
 from omnid.core.rig.rig_health import (
     MIN_MATCHES,
     RigFinding,
@@ -47,7 +47,7 @@ class RigCheckResult:
 def check_log(log: Path, rig: Rig, cameras: LogCameras) -> RigCheckResult:
     """Check a rig by pairs spread over a log; OmnidError where they show too little."""
     pairs = read_rig_pairs(log, rig, cameras)
-    found = check_rig(pairs, rig, Config().panorama)
+    found = check_rig(pairs, rig)
     if abs(found.skew_s) >= MAX_SKEW_S:
         raise OmnidError(
             f"calibrate drive: --only check would take motion for a drift: the upper images are "
@@ -84,8 +84,9 @@ def read_rig_pairs(log: Path, rig: Rig, cameras: LogCameras) -> list[FramePair]:
     return found
 
 
-def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> RigCheckResult:
+def check_rig(pairs: Sequence[FramePair], rig: Rig) -> RigCheckResult:
     """Check a rig by pairs of images."""
+    config = PanoramaConfig()
     rectification = geometry(rig, config)
     dewarp = Dewarp(rectification, config)
     seen = map(dewarp.process, pairs)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from calib.rig import SIDES, Rig
 from calib.rig_file import png, read_rig, write_rig
 from calib.validation import read_text, silent
 from drivers.logs.log_reader import LogCameras, LogReader
-from omnid.calibration.board_search import require_one_orientation
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
 from omnid.calibration.images import read_pairs
@@ -38,6 +38,7 @@ from omnid.sinks.files import check_outputs
 from omnid.transport.bus import Bus
 from omnid.transport.codec import diagnostics_cdr
 
+T = TypeVar("T")
 # Options that each kind of board needs.
 NEEDED = {"checkerboard": ("corners", "square_mm"), "aprilgrid": ("tags", "tag_mm", "tag_spacing")}
 
@@ -62,9 +63,7 @@ def board_of(args: argparse.Namespace) -> AnyBoard:
         columns, rows = args.tags
         return AprilGrid(columns, rows, args.tag_mm / 1e3, args.tag_spacing)
     columns, rows = args.corners
-    board = Board(columns, rows, args.square_mm / 1e3)
-    require_one_orientation(board)
-    return board
+    return Board(columns, rows, args.square_mm / 1e3)
 
 
 @options.command(BOARD, options.LOG_CAMERAS, options.HEIGHT, options.QUIET)
@@ -203,16 +202,17 @@ def drive(args: argparse.Namespace) -> int:
             print(f"{args.rig or 'the attached rig'} fits this drive as well as any rig")
         rig = adjusted.rig if adjusted.is_better else rig
     # 3. Find the height, and the masks; a log that shows none of them is no error but for --only.
-    rig = _at_height(args, rig)
+    if args.height_m is not None:
+        rig = rig.at_height(args.height_m)
+    elif "height" in args.only or (not args.only and rig.height_m() is None):
+        height = _measured(args, rig, calibrate_height)
+        if height is not None:
+            print(f"the rig so far: {height_of(rig)}")
+            rig = height.rig
     if not args.only or "mask" in args.only:
-        try:
-            mask = calibrate_mask(args.log, rig, topics)
-            print(mask)
-            rig = mask.rig if mask.share or args.only else rig
-        except OmnidError as error:
-            if args.only:
-                raise
-            print(error)
+        mask = _measured(args, rig, calibrate_mask)
+        if mask is not None and (mask.share or args.only):
+            rig = mask.rig
     # 4. Write the rig.
     if args.output is not None and rig is start:
         print("nothing was written")
@@ -223,26 +223,17 @@ def drive(args: argparse.Namespace) -> int:
     return 0 if is_found and not has_drifted else 1
 
 
-def _at_height(args: argparse.Namespace, rig: Rig) -> Rig:
-    """Return the rig with the height that is given, or else by the floor.
-
-    Without --only, a height that the rig states is kept, and a floor that is not seen is no error.
-    """
-    if args.height_m is not None:
-        return rig.at_height(args.height_m)
-    is_wanted = "height" in args.only
-    if not is_wanted and (args.only or rig.height_m() is not None):
-        return rig
+def _measured(args: argparse.Namespace, rig: Rig, measure: Callable[[Path, Rig, LogCameras], T]) -> T | None:
+    """Print and return what a log shows of a rig; None where it does not, which is an error for --only."""
     try:
-        found = calibrate_height(args.log, rig, log_cameras(args))
+        found = measure(args.log, rig, log_cameras(args))
     except OmnidError as error:
-        if is_wanted:
+        if args.only:
             raise
         print(error)
-        return rig
+        return None
     print(found)
-    print(f"the rig so far: {height_of(rig)}")
-    return found.rig
+    return found
 
 
 @options.command(options.HEIGHT)

@@ -191,19 +191,15 @@ def consistent_views(
 def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
     """Return the covariance of a calibration's parameters for its rig."""
     names = [f"{side} {name}" for side in SIDES for name in found.fit.rig.names]
-    R_rect_lower = se3.R_of(rig.T_rect_rig) @ se3.R_of(rig.lower.T_cam_rig).T
-    R_upper_rect = se3.R_of(found.T_upper_lower) @ R_rect_lower.T
 
-    def transform(twist: Array) -> Array:
-        """Return the parameters TRANSFORM_NAMES (6,) after a twist of T_upper_lower."""
-        T_lower_upper = se3.inverse(se3.exp(twist) @ found.T_upper_lower)
-        turn = se3.rotation_log(R_rect_lower @ se3.R_of(T_lower_upper) @ R_upper_rect)
-        x, y, z = R_rect_lower @ se3.t_of(T_lower_upper)
-        return np.array([*turn, x / z, y / z, np.linalg.norm(se3.t_of(T_lower_upper))])
+    def moves(twist: Array) -> Array:
+        """Return the moves (6,) TRANSFORM_NAMES of the upper camera by a twist of T_upper_lower."""
+        T_upper_rig = se3.exp(twist) @ rig.upper.T_cam_rig
+        return rig.moves_to(replace(rig, upper=replace(rig.upper, T_cam_rig=T_upper_rig)))
 
     count = len(names) + len(TWIST_NAMES)
     J = np.eye(count)
-    J[len(names) :, len(names) :] = central_differences(transform, BEST_STEP * np.ones(len(TWIST_NAMES)))
+    J[len(names) :, len(names) :] = central_differences(moves, BEST_STEP * np.ones(len(TWIST_NAMES)))
     return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.fit.covariance[:count, :count] @ J.T)
 
 

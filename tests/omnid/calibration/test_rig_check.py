@@ -14,7 +14,6 @@ from calib.rig_file import read_rig, write_rig
 from omnid.calibration.images import BY_NAME
 from omnid.calibration.rig_check import RigCheckResult, check_rig, read_rig_pairs
 from omnid.cli import main
-from omnid.config import PanoramaConfig
 from omnid.core.rig.rig_health import RigState
 from omnid.messages import FramePair
 from tests.replay.edited import images, save
@@ -44,7 +43,7 @@ def pairs(drive: Path) -> list[FramePair]:
 
 
 def check_rotated(drive: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
-    return check_rig(pairs, with_upper_rotated(read_rig(drive / "rig.toml"), turn_deg), PanoramaConfig())
+    return check_rig(pairs, with_upper_rotated(read_rig(drive / "rig.toml"), turn_deg))
 
 
 def test_motion_between_the_exposures_is_no_drift(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
