@@ -14,7 +14,7 @@ from msgspec import Meta, Struct
 from drivers.logs.log import LATEST_NS
 from omnid.core.navigation.path import FARTHEST_M
 from omnid.core.navigation.requests import route_name
-from omnid.core.navigation.route import DECIMALS, MOST_POINTS, Route
+from omnid.core.navigation.route import MOST_POINTS, Route
 from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_whole
@@ -22,6 +22,7 @@ from omnid.formats.exports import write_whole
 SUFFIX: Final = ".route.json"
 # Limit of what is read: the longest route that can be taught, of MOST_POINTS points, has less than 4 MB.
 MAX_BYTES: Final = 8 << 20
+DECIMALS: Final = 6  # micrometres
 _PARTS: Final = ("x_m", "y_m", "yaw_rad")
 COLUMNS: Final = [*_PARTS, "speed_mps", "keyframe", *(f"in_keyframe_{part}" for part in _PARTS)]
 

@@ -14,7 +14,6 @@ from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.control_law import ControllerState
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.core.navigation.follower import STANDSTILL
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import (
@@ -158,19 +157,17 @@ class NavigationStage:
         self._newest_keyframe = update.keyframe, planar(T_map_keyframe)
         self.keyframes = update.keyframes or self.keyframes
 
-    def _request(self, command: NavigationCommand) -> NavigationUpdate:
+    def _request(self, command: NavigationCommand) -> NavigationUpdate | None:
         """Execute a request; return the new state with the answer, which for a finished route its writer gives."""
-        navigator, word, taught, refusal = self._navigator, _word(command), self._taught, ""
+        word, taught, refusal = _word(command), self._taught, ""
         try:
             self._execute(command)
         except OmnidError as error:
             refusal = str(error)
         if self._taught is taught:
             self._answer = RequestAnswer(command.id, word, refusal)
-        setpoint = STANDSTILL if navigator.stopping else None
-        update = self._update(Navigation(setpoint, navigator.state, navigator.reason), always=True)
-        assert update is not None
-        return update
+        self._published = ()  # so that the state is sent in any case
+        return self._update(self._navigator.answer)
 
     def _execute(self, command: NavigationCommand) -> None:
         """Execute a request. Raise OmnidError with the reason to refuse it."""
@@ -271,7 +268,6 @@ class NavigationStage:
 
     def _finish(self, command: NavigationCommand) -> None:
         """Pass the recorded route on to be written; without one the last route again, whose disk may have been full."""
-        self._require_map(teaches=True)
         if self._recorder is not None:
             created_s = command.arrival_ns // NS_PER_S
             route = self._recorder.route(self._keyframe_poses(), created_s, self.map_name)
@@ -289,13 +285,13 @@ class NavigationStage:
             for id, T_map_rect in self.keyframes.T_map_rect.items()
         }
 
-    def _require_map(self, *, teaches: bool = False) -> None:
-        """Raise OmnidError where no route can be tied to a map. teaches: a route may be taught now."""
+    def _require_map(self) -> None:
+        """Raise OmnidError where no route can be tied to a map, or one is being taught."""
         if not self.map_name:
             raise OmnidError(
                 "routes need a map that is saved: start the robot (`omnid run`, `omnid simulate`) with --map FILE.omap"
             )
-        if self._recorder is not None and not teaches:
+        if self._recorder is not None:
             raise OmnidError(
                 f"the route {self._recorder.name} is being taught: finish it, or drop it (`omnid route stop`)"
             )
@@ -311,17 +307,16 @@ class NavigationStage:
             raise OmnidError("there is no pose yet: wait until the robot is ready (`omnid listen`)")
         return self._now._replace(in_map=self._in_map, wheels=self._wheels)
 
-    def _update(self, now: Navigation, *, always: bool = False) -> NavigationUpdate | None:
-        navigator, answer, recorder = self._navigator, self._answer, self._recorder
+    def _update(self, now: Navigation) -> NavigationUpdate | None:
+        drive, answer, recorder = self._navigator.drive, self._answer, self._recorder
         stamp_ns = 0 if self._now is None else self._now.stamp_ns
         plan, self._plan = self._plan, None
         teaching = recorder.name if recorder else ""
         state = (now.state, now.reason, self._task, teaching, self._taught, answer)
         same = state == self._published and now.setpoint is None and plan is None
-        if same and not always and stamp_ns - self._published_ns < REPEAT_NS:
+        if same and stamp_ns - self._published_ns < REPEAT_NS:
             return None
         self._published, self._published_ns = state, stamp_ns
-        drive = navigator.drive
         return NavigationUpdate(
             self._seq,
             stamp_ns,

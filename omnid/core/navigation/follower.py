@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib.se2_arrays import predicted
 from omnid.core.control.collision_monitor import LEAST_MPS
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
-from omnid.core.navigation.path import BEGIN, DrivePath, PathLeg, PathPlace, straight_leg
+from omnid.core.navigation.path import BEGIN, DrivePath, PathPlace, straight_leg
 from omnid.core.navigation.settings import NavigationSettings
 
 Array = NDArray[np.float64]
@@ -55,14 +55,10 @@ class Follower:
 
     def _begin(self, number: int, s_m: float = 0.0, speed_mps: float = 0.0) -> None:
         """Begin a leg at a way on it."""
-        self._number, self._s_m = number, s_m
+        self._number, self._leg, self._s_m = number, self._legs[number], s_m
         self._last_ns: int | None = None
         self._turns = True  # until the first step finds that no turn is needed
         self._speed_mps = max(0.0, -speed_mps if self._leg.backwards else speed_mps)
-
-    @property
-    def _leg(self) -> PathLeg:
-        return self._legs[self._number]
 
     def ahead(self, way_m: float) -> tuple[Array, list[PathPlace]]:
         """Return points (N, 2) of the path from the nearest one on, of at least a length, and their places on it."""

@@ -194,9 +194,10 @@ class Navigator:
         self._planner = Planner(self.settings, self.collision)
 
     @property
-    def stopping(self) -> bool:
-        """True if a stop is to be sent."""
-        return self._stops > 0 or (self.drive is not None and bool(self.drive.paused))
+    def answer(self) -> Navigation:
+        """The state and its reason without a new pose, and the stop that is to be sent."""
+        stops = self._stops > 0 or (self.drive is not None and bool(self.drive.paused))
+        return Navigation(STANDSTILL if stops else None, self.state, self.reason)
 
     def start(self, frame: NavigationFrame, paths: list[DrivePath], now: Situation) -> None:
         """Begin a drive, which replaces the one before."""
@@ -229,8 +230,8 @@ class Navigator:
         dt_s = 0.0 if self._last_ns is None else min(max((now.stamp_ns - self._last_ns) * 1e-9, 0.0), LONGEST_STEP_S)
         self._last_ns, drive, settings = now.stamp_ns, self.drive, self.settings
         if drive is None:
-            self._stops, stop = max(self._stops - 1, 0), STANDSTILL if self._stops else None
-            return Navigation(stop, self.state, self.reason)
+            answer, self._stops = self.answer, max(self._stops - 1, 0)
+            return answer
         # 1. Faults of wheels or pose, and other sources of commands.
         self._follow_map(drive, now)
         hold = held(drive, now, settings)
@@ -239,8 +240,8 @@ class Navigator:
         drive.resets = now.resets
         # 2. The way.
         following = drive.step(now, self._clearance_m(drive, now))
-        move = _kind(following.setpoint)
-        drive.move = drive.move if move is None else move
+        if following.setpoint != STANDSTILL:
+            drive.move = _kind(following.setpoint)
         if following.missed_m is not None:
             return self._finished(drive, following.missed_m)
         if abs(following.offset_m) > settings.corridor_m + self._planner.required_m:
@@ -427,15 +428,13 @@ def _behind(path: Array, is_blocked: NDArray[np.bool_]) -> int | None:
     for k in range(free_from, len(path)):
         if is_blocked[k]:
             free_from = k + 1
-        elif ways[k] - ways[min(free_from, k)] >= REJOIN_M or k == len(path) - 1:
+        elif ways[k] - ways[free_from] >= REJOIN_M or k == len(path) - 1:
             return k
     return None
 
 
-def _kind(setpoint: Setpoint) -> Move | None:
-    """Return the kind of a motion, None for none."""
-    if setpoint == STANDSTILL:
-        return None
+def _kind(setpoint: Setpoint) -> Move:
+    """Return the kind of a motion."""
     if setpoint.velocity_mps == 0.0:
         return Move.TURN
     return Move.AHEAD if setpoint.velocity_mps > 0.0 else Move.BACK

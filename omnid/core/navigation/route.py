@@ -31,7 +31,6 @@ ENTRY_M: Final = 1.5  # Most distance of the robot from a route that it repeats.
 ENTRY_M_PER_RAD: Final = 0.5  # Cost of a radian of heading error where several pieces of a route are near.
 BESIDE_M: Final = 0.25  # A robot that is farther from the route drives to a point ahead on it.
 JOIN: Final = 2.5  # Way along the route to that point by lateral distance: at 22 degrees, which is no corner.
-DECIMALS: Final = 6  # Decimals of a route, as in its file, so that reading it changes nothing.
 
 
 class KeyframePose(NamedTuple):
@@ -156,16 +155,14 @@ class RouteRecorder:
         route = Route(
             self.name,
             np.array(poses),
-            np.array(speeds).round(DECIMALS),
+            np.array(speeds),
             np.array(ids, np.int64),
             np.array(in_keyframe),
             {id: keyframe.stamp_ns for id, keyframe in keyframes.items()},
             created_s,
             map_name,
         )
-        return replace(
-            route, poses=route.in_map(keyframes).round(DECIMALS), in_keyframe=route.in_keyframe.round(DECIMALS)
-        )
+        return replace(route, poses=route.in_map(keyframes))
 
 
 def repeated_paths(
