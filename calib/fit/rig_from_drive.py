@@ -220,6 +220,8 @@ class DriveProblem:
         error, by_pose, by_steps, of_landmarks = self._jacobians(state, scale)
         landmark, between = self.observations.landmark, by_pose.T @ by_steps
         A = np.block([[(by_pose.T @ by_pose).toarray(), between], [between.T, by_steps.T @ by_steps + self.prior]])
+        # A keyframe of which no landmark is left stays where it is.
+        A += np.diag(np.diag(A) == 0)
         blocks = np.zeros((len(state.points), 3, 3))
         np.add.at(blocks, landmark, np.swapaxes(of_landmarks, 1, 2) @ of_landmarks)
         by_point = _scattered(of_landmarks, landmark, len(state.points))

@@ -110,6 +110,17 @@ def test_landmarks_that_move_are_left_out(truth: Rig) -> None:
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
 
 
+def test_a_keyframe_of_which_no_landmark_is_left_stays(truth: Rig) -> None:
+    """Its pose is an unknown that no observation shows."""
+    state, observations = drive(truth, 4)
+    kept, used = observations.only(observations.keyframe != 5)
+    parameters = RigParameters.about(truth)
+    begin = replace(state, points=state.points[used], steps=np.zeros(len(parameters.names)))
+    found = adjust_drive(parameters, begin, kept)
+    assert np.isfinite(found.covariance).all() and np.median(rays_apart_deg(found.rig, truth)) < 0.01
+    np.testing.assert_array_equal(found.state.T_rig_odom[5], state.T_rig_odom[5])
+
+
 def problem_points(truth: Rig, state: DriveState, observations: DriveObservations) -> Array:
     """Return the landmark of each observation in the rig frame."""
     parameters = RigParameters.about(truth)
