@@ -23,7 +23,7 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.lens import full_turn
 from calib.models.names import camera_of, sees_directly
 from calib.models.ocam import OcamCamera, View
-from calib.models.unified import UnifiedCamera
+from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
 from calib.rig import (
     MAX_LEAN,
     MAX_UPPER_DELAY_S,
@@ -40,12 +40,11 @@ from calib.validation import Warn, load_yaml, read_text, require_image_size, sil
 Matrix: TypeAlias = tuple[tuple[float, ...], ...]
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
 _FOCAL: Final = ("fu", "fv", "pu", "pv")
-_RADTAN: Final = ("k1", "k2", "p1", "p2")
 # Kalibr's projection and distortion: the model, and the names of its intrinsics and of its distortion.
 MODELS: Final[Mapping[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]]] = {
-    ("omni", "radtan"): ("omni", ("xi", *_FOCAL), _RADTAN),
+    ("omni", "radtan"): ("omni", ("xi", *_FOCAL), DISTORTION_NAMES),
     ("omni", "none"): ("omni", ("xi", *_FOCAL), ()),
-    ("pinhole", "radtan"): ("omni", _FOCAL, _RADTAN),
+    ("pinhole", "radtan"): ("omni", _FOCAL, DISTORTION_NAMES),
     ("pinhole", "none"): ("omni", _FOCAL, ()),
     ("pinhole", "equidistant"): ("equidistant", _FOCAL, ("k1", "k2", "k3", "k4")),
     ("ds", "none"): ("ds", ("xi", "alpha", *_FOCAL), ()),

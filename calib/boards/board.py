@@ -139,17 +139,12 @@ class PrintShape:
         return self.values[3]
 
     def points(self, drawn: Array) -> Array:
-        """Return the print's corners (N, 3) [m] of those of the drawing (N, 3), z 0."""
-        return self.points_of(drawn, drawn)
-
-    def points_of(self, drawn: Array, places: Array) -> Array:
-        """Return points (M, 3) [m] of the print at places (M, 3), z 0, in a drawing with corners drawn (N, 3).
+        """Return the print's corners (N, 3) [m] of those of the drawing (N, 3), z 0.
 
         A sheet that bends keeps its lengths: points move inwards by the integral of half its squared slope.
         """
-        middle, half = _sides(drawn)
-        uv = (places[:, :2] - middle) / half
-        moved = places + _moves(uv, half) @ (np.array(self.values) / MODE_SIGMAS)
+        uv, half = _sides(drawn)
+        moved = drawn + all_modes(drawn) @ (np.array(self.values) / MODE_SIGMAS)
         moved[:, :2] -= 2 / 3 * np.array(self.values[:2]) ** 2 * uv**3 / half
         return np.asarray(moved)
 
@@ -175,19 +170,15 @@ AS_DRAWN = PrintShape()
 
 def all_modes(drawn: Array) -> Array:
     """Return the moves (N, 3, 4) [m] of a drawing's corners (N, 3) by one step of every mode."""
-    middle, half = _sides(drawn)
-    return _moves((drawn[:, :2] - middle) / half, half)
-
-
-def _sides(drawn: Array) -> tuple[Array, Array]:
-    """Return the middle (2,) of a board's corners, and half their sides (2,) [m]."""
-    low, high = drawn[:, :2].min(axis=0), drawn[:, :2].max(axis=0)
-    return (low + high) / 2, (high - low) / 2
-
-
-def _moves(uv: Array, half: Array) -> Array:
-    """Return the moves (N, 3, 4) [m] by one step of every mode, of places (N, 2) as a fraction of half the sides."""
+    uv, half = _sides(drawn)
     moves = np.zeros((len(uv), 3, len(MODE_NAMES)))
     moves[:, 2, :3] = np.column_stack([1 - uv**2, uv[:, :1] * uv[:, 1:]])
     moves[:, :2, 3] = uv * half * (-0.5, 0.5)
     return np.asarray(moves * MODE_SIGMAS)
+
+
+def _sides(drawn: Array) -> tuple[Array, Array]:
+    """Return the places u, v (N, 2) of a board's corners, from -1 to 1 along its sides, and half the sides (2,) [m]."""
+    low, high = drawn[:, :2].min(axis=0), drawn[:, :2].max(axis=0)
+    half = (high - low) / 2
+    return (drawn[:, :2] - (low + high) / 2) / half, half

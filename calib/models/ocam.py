@@ -34,7 +34,7 @@ TANGENTIAL_NAMES, ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
 TABLE_SIZE = 1025
 # A camera with a wavefront is exact for points at this distance; half of it and twice as far have the same error.
 DISTANCE_M = 1.5
-NO_WAVEFRONT = (0.0,) * wavefronts.TERMS
+NO_WAVEFRONT = (0.0,) * len(wavefronts.WAVEFRONT_NAMES)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,6 @@ from calib.models.camera import Array
 
 # The terms a, b, c_x, c_y, s, as files and results name them.
 WAVEFRONT_NAMES = ("w_a", "w_b", "w_x", "w_y", "w_s")
-TERMS = len(WAVEFRONT_NAMES)
 # Iterations of the direction, because each reduces its error by the offset as a fraction of the distance, 1 / 1000.
 STEPS = 4
 # Least value of 1 + z, for directions opposite to the axis: guards against division by zero.
