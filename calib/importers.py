@@ -35,7 +35,7 @@ from calib.rig import (
     rig_between,
 )
 from calib.typed_toml import shown
-from calib.validation import Warn, load_yaml, read_text, require_image_size, silent, transform_of
+from calib.validation import LineReporter, load_yaml, read_text, require_image_size, silent, transform_of
 
 Matrix: TypeAlias = tuple[tuple[float, ...], ...]
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
@@ -86,7 +86,7 @@ def parse_chain(
     lower: str = "",
     upper: str = "",
     frame: str = "imu",
-    warn: Warn = silent,
+    warn: LineReporter = silent,
 ) -> Rig:
     """Parse the rig of a camchain.yaml's text; lower and upper: names of cameras (cam0), instead of topic or height.
 
@@ -170,7 +170,7 @@ def _lower_and_upper(
     chain: Mapping[str, KalibrCamera],
     named: tuple[str, str],
     poses: Mapping[str, Array],
-    warn: Warn,
+    warn: LineReporter,
     *,
     has_rig_frame: bool,
 ) -> tuple[str, str]:
@@ -213,7 +213,7 @@ def _lower_and_upper(
 
 # 2. OCamCalib's `calib_results.txt`, and the transform between two cameras.
 def import_pair(
-    lower_path: Path, upper_path: Path, T_lower_upper: Array, view: View = "mirror", warn: Warn = silent
+    lower_path: Path, upper_path: Path, T_lower_upper: Array, view: View = "mirror", warn: LineReporter = silent
 ) -> Rig:
     """Read the rig of two files of OCamCalib; its frame is the lower viewpoint's, see rig_between."""
     lower, upper = (parse_ocam(read_text(path), view, str(path)) for path in (lower_path, upper_path))

@@ -23,7 +23,7 @@ from calib.typed_toml import bytes_of, shown
 MAX_FILE_BYTES = 16_000_000
 MAX_SIDE_PX = 32767  # because OpenCV's remap takes no larger images
 MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memory
-Warn: TypeAlias = Callable[[str], None]
+LineReporter: TypeAlias = Callable[[str], None]  # receives warnings, or the progress of a long calibration
 
 
 def read_bytes(path: str | PathLike[str]) -> bytes:

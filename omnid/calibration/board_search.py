@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -13,11 +13,9 @@ from calib.boards.board import AnyBoard, AprilGrid, Board
 from calib.boards.checkerboard import find_board
 from calib.models.camera import Array
 from calib.models.ocam import View
-from calib.validation import silent
+from calib.validation import LineReporter, silent
 from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
-
-Progress = Callable[[str], None]  # receives the lines that a long calibration reports while it runs
 
 
 def require_one_orientation(board: AnyBoard) -> None:
@@ -33,7 +31,7 @@ def search_board(image: Image, board: AnyBoard) -> Array | None:
     return find_board(image, board) if isinstance(board, Board) else find_april_grid(image, board)
 
 
-def find_boards(images: Images, board: AnyBoard, progress: Progress = silent) -> dict[str, Array]:
+def find_boards(images: Images, board: AnyBoard, progress: LineReporter = silent) -> dict[str, Array]:
     """Return the corners (N, 2) [px] by the names of the images that show a board; OmnidError if there is none."""
     views = dict[str, Array]()
     with ThreadPoolExecutor(os.cpu_count()) as pool:

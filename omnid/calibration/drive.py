@@ -23,9 +23,8 @@ from calib.models.camera import Array
 from calib.models.ocam import has_wavefront
 from calib.rig import Rig, RigCovariance
 from calib.rig_file import read_rig
-from calib.validation import silent
+from calib.validation import LineReporter, silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
-from omnid.calibration.board_search import Progress
 from omnid.calibration.drive_observations import collect
 from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
 from omnid.core.rig.rig_health import SIGMAS
@@ -63,7 +62,7 @@ def calibrate_drive(
     log: str | PathLike[str],
     rig: str | PathLike[str] | Rig,
     topics: AnyCameras = (None, None),
-    progress: Progress = silent,
+    progress: LineReporter = silent,
 ) -> DriveCalibration:
     """Return the rig that fits a drive best, near the one given; OmnidError or CalibError where it does not suffice.
 
@@ -98,7 +97,7 @@ def calibrate_drive(
     return DriveCalibration(_finished_rig(before, found), found, first_sigma_px)
 
 
-def straightened(log: Path, parameters: RigParameters, cameras: LogCameras, progress: Progress) -> Array:
+def straightened(log: Path, parameters: RigParameters, cameras: LogCameras, progress: LineReporter) -> Array:
     """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
     rig = parameters.rig
     finding = check_rig(read_rig_pairs(log, rig, cameras), rig).finding

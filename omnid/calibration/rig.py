@@ -18,10 +18,9 @@ from calib.models.ocam import View
 from calib.rig import SIDES, Rig, mounting_notes, rig_between
 from calib.rig_file import write_rig
 from calib.rim import find_rim
-from calib.validation import silent
+from calib.validation import LineReporter, silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import (
-    Progress,
     find_boards,
     require_one_orientation,
     view_of_tags,
@@ -81,7 +80,7 @@ def calibrate_rig(
     topics: AnyCameras = (None, None),
     view: View | None = None,
     expected_baseline_m: float | None = None,
-    progress: Progress = silent,
+    progress: LineReporter = silent,
 ) -> RigResult:
     """Calibrate two cameras and the transform between them by images of a board.
 
@@ -117,7 +116,7 @@ def calibrate_rig(
     return RigResult(rig, found, images, (*images.notes, *mounting_notes(rig), *unmasked, *left_out))
 
 
-def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
+def _find_views(images: PairedImages, board: AnyBoard, progress: LineReporter) -> list[PairView]:
     """Find the board in the images of both cameras."""
     found = list[dict[str, Array]]()
     for name, side in zip(SIDES, images.sides, strict=True):

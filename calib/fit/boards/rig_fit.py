@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -20,6 +20,7 @@ from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
 from calib.rig import SIDES, TRANSFORM_NAMES, Rig, RigCovariance
+from calib.validation import LineReporter, silent
 
 # With four views the median of their errors still shows which one is wrong; fewer are not enough for that.
 MIN_VIEWS: Final = 4
@@ -29,7 +30,6 @@ BAD_RATIO, BAD_PX, BAD_RAD = 4.0, 0.25, 0.01
 # Larger mean errors mean that the images do not show one board at one time: right ones have 0.05 to 0.15 px.
 MAX_MEAN_PX: Final = 3.0
 Images = Mapping[str, NDArray[np.uint8]]
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def calibrate_boards(
     sizes: Sequence[tuple[int, int]],
     view: View = "mirror",
     images: Sequence[Images] = (),
-    progress: Progress = lambda line: None,
+    progress: LineReporter = silent,
 ) -> RigCalibration:
     """Calibrate one camera or two, and the transform between them, by views of a board; outlier views are rejected.
 
