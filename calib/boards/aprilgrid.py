@@ -80,11 +80,7 @@ def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: f
     at, where = places, outlines
     while True:
         tried = np.flatnonzero(np.isnan(pixels[:, 0])).tolist()
-        predicted = {k: local_mapping(points[k], at, where) for k in tried}
-        mappings = {k: mapping for k, mapping in predicted.items() if mapping is not None}
-        if not mappings:
-            break
-        found = shown_corners(image, mappings, window)
+        found = shown_corners(image, {k: local_mapping(points[k], at, where) for k in tried}, window)
         if not found:
             break
         pixels[list(found)] = np.array(list(found.values()))

@@ -39,7 +39,9 @@ def find_board(image: Image, board: Board) -> Array | None:
     in the image. The first square is dark where the board's sides (one even, one odd) determine it.
     """
     blurred, points = smoothed(image), board.points[:, :2] / board.square_m
-    for grid in _grids(image, board):
+    # Those nearest to the board's size come first.
+    grids = sorted(find_grids(blurred, find_corners(image)), key=lambda grid: abs(np.log(len(grid) / len(points))))
+    for grid in map(with_clockwise_axes, grids):
         # 1. Grow the grid by corners of the image itself.
         placed = _fullest_window(grow_grid(blurred, grid, _most_corners(board)), board)
         if placed is None or not _is_whole(placed):
@@ -92,12 +94,6 @@ def _square_means(image: Grey, corners: Array, board: Board) -> Array:
             inside = ((pixels >= 0) & (pixels <= np.array(image.shape[::-1]) - 1)).all()
             level[row, column] = sample(image, pixels).mean() if inside else np.nan
     return level
-
-
-def _grids(image: Image, board: Board) -> list[Grid]:
-    """Return the grids of linked corners, those nearest to the board's size first."""
-    grids, size = find_grids(smoothed(image), find_corners(image)), board.columns * board.rows
-    return [with_clockwise_axes(grid) for grid in sorted(grids, key=lambda grid: abs(np.log(len(grid) / size)))]
 
 
 def _most_corners(board: Board) -> int:

@@ -83,11 +83,10 @@ def grow_grid(image: Grey, grid: Grid, max_count: int) -> Grid:
         at, where = np.array(list(grid), float), np.array(list(grid.values()))
         border = {(i + di, j + dj) for i, j in grid for di, dj in STEPS} - set(grid) - refused
         mappings = {cell: local_mapping(np.array(cell, float), at, where) for cell in border}
-        known = {cell: mapping for cell, mapping in mappings.items() if mapping is not None}
-        found = shown_corners(image, known, WINDOW) if known else {}
+        found = shown_corners(image, mappings, WINDOW)
         if not found:
             break
-        refused |= set(known) - set(found)
+        refused |= {cell for cell, mapping in mappings.items() if mapping is not None} - set(found)
         # A refused cell may be predicted better with a new neighbour.
         for cell in found:
             refused -= {(cell[0] + di, cell[1] + dj) for di, dj in STEPS}
@@ -95,11 +94,14 @@ def grow_grid(image: Grey, grid: Grid, max_count: int) -> Grid:
     return grid
 
 
-def shown_corners(image: Grey, predicted: Mapping[Key, LocalMapping], window: float) -> dict[Key, Array]:
-    """Return the predicted corners that the image shows, refined.
+def shown_corners(image: Grey, mappings: Mapping[Key, LocalMapping | None], window: float) -> dict[Key, Array]:
+    """Return the corners with a mapping (None: not predicted) that the image shows, refined.
 
     window: half side [squares] of the window about a corner in which grey depends on that corner alone.
     """
+    predicted = {key: mapping for key, mapping in mappings.items() if mapping is not None}
+    if not predicted:
+        return {}
     radius = np.maximum(RING_PX, window * np.array([mapping.side_px for mapping in predicted.values()]))
     refined, moves = predicted_corners(image, list(predicted.values()), window)
     seen = describe_corners(image, refined, radius)
