@@ -143,6 +143,7 @@ def replay(args: argparse.Namespace) -> int:
 
     computation:
     --method default|paper [odometry.method]   paper: the odometry of the paper on its enhanced SAD, for comparison
+    --tracker improved|klt [odometry.tracker]  feature tracker of the paper's method
     --inline    one thread, one pair after the other; same results
     --realtime  at the speed of the recording, where the computer is fast enough
 
