@@ -48,18 +48,18 @@ class Cylinder:
     width: int
     height: int
     row0: float
-    turn_px: int = 0  # columns of a full turn, of which the panorama has `width`; 0: all of them
+    period_px: int = 0  # columns of a full turn, of which the panorama has `width`; 0: all of them
     first: int = 0  # column of the full turn that is column 0
     scale: float = field(default=1.0, compare=False)  # columns by those of the images' own resolution
 
     def __post_init__(self) -> None:
-        if not self.turn_px:
-            object.__setattr__(self, "turn_px", self.width)
+        if not self.period_px:
+            object.__setattr__(self, "period_px", self.width)
 
     @property
     def focal_px(self) -> float:
         """Return the pixels per radian of azimuth, and per unit of z/r: square pixels on the horizon."""
-        return self.turn_px / (2 * math.pi)
+        return self.period_px / (2 * math.pi)
 
     @property
     def left_rad(self) -> float:
@@ -69,14 +69,14 @@ class Cylinder:
     def resized(self, width: int) -> Cylinder:
         """Return the panorama of about the same view in other columns."""
         scale = width / self.width
-        turn_px, first = round(self.turn_px * scale), round(self.first * scale)
+        period_px, first = round(self.period_px * scale), round(self.first * scale)
         height = max(1, round(self.height * scale))
-        return Cylinder(width, height, self.row0 * scale, turn_px, first, self.scale * scale)
+        return Cylinder(width, height, self.row0 * scale, period_px, first, self.scale * scale)
 
     @property
     def full_turn(self) -> Cylinder:
         """Return the panorama of the full turn of which this is a sector."""
-        return Cylinder(self.turn_px, self.height, self.row0, scale=self.scale)
+        return Cylinder(self.period_px, self.height, self.row0, scale=self.scale)
 
     def azimuth(self, columns: Array) -> Array:
         """Return the azimuths (N,) of columns (N,)."""
@@ -94,17 +94,17 @@ class Cylinder:
         """
         r = np.hypot(points[:, 0], points[:, 1])
         column = (self.left_rad - np.arctan2(points[:, 1], points[:, 0])) * self.focal_px - 0.5
-        if self.width < self.turn_px:
+        if self.width < self.period_px:
             column = self.width / 2 + self.wrap(column - self.width / 2)
         return np.column_stack([column, self.row0 - self.focal_px * points[:, 2] / np.maximum(r, MIN_RADIUS)])
 
     def wrap(self, columns: Array) -> Array:
         """Return column differences, mapped to [-turn/2, turn/2)."""
-        return np.asarray((columns + self.turn_px / 2) % self.turn_px - self.turn_px / 2)
+        return np.asarray((columns + self.period_px / 2) % self.period_px - self.period_px / 2)
 
     def shows(self, columns: Array) -> NDArray[np.bool_]:
         """True (N,) for columns, as `pixels` returns them, that the panorama has."""
-        return np.asarray((self.width == self.turn_px) | ((columns >= 0) & (columns <= self.width - 1)))
+        return np.asarray((self.width == self.period_px) | ((columns >= 0) & (columns <= self.width - 1)))
 
 
 def fit_cylinder(
@@ -117,7 +117,7 @@ def fit_cylinder(
     # 1. The sector of azimuth, and the slopes, that both cameras see.
     right_rad, span_rad, slopes = _shared_view(rig, elevation_deg)
     # 2. Columns.
-    own_px, turn = _turn_px(rig, right_rad, span_rad, float(np.clip(0.0, slopes.min(), slopes.max()))), width_px
+    own_px, turn = _period_px(rig, right_rad, span_rad, float(np.clip(0.0, slopes.min(), slopes.max()))), width_px
     if turn:
         scale = turn / own_px if math.isfinite(own_px) else 1.0
     elif math.isfinite(own_px):
@@ -230,7 +230,7 @@ def _seen(rig: Rig, mounted: MountedCamera, slopes: Array, azimuth: Array) -> ND
     return np.asarray(seen.reshape(len(slopes), -1))
 
 
-def _turn_px(rig: Rig, right_rad: float, span_rad: float, slope: float) -> float:
+def _period_px(rig: Rig, right_rad: float, span_rad: float, slope: float) -> float:
     """Return the length [px] of a full turn in the images, from that of the sector at a slope, in the coarser camera.
 
     That of a full circle is the length of the horizon; NaN where a camera does not see it.

@@ -151,13 +151,13 @@ class EquirectangularCamera(_Lens):
 
     def __post_init__(self) -> None:
         self._check("equirectangular")
-        if self.size[0] > round(self._turn_px):
+        if self.size[0] > round(self._period_px):
             raise CalibError(
-                f"equirectangular camera: {self.size[0]} columns are more than a full turn of {self._turn_px:.1f}"
+                f"equirectangular camera: {self.size[0]} columns are more than a full turn of {self._period_px:.1f}"
             )
 
     @property
-    def _turn_px(self) -> float:
+    def _period_px(self) -> float:
         return 2 * math.pi * self.focal[0]
 
     def project(self, points: Array) -> Array:
@@ -169,8 +169,8 @@ class EquirectangularCamera(_Lens):
         azimuth, elevation = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
         azimuth = np.where(((x == 0) & (y == 0) & (z == 0)) | ~np.isfinite(x + y + z), np.nan, azimuth)
         u, middle = self.center[0] + self.focal[0] * azimuth, (self.size[0] - 1) / 2
-        u = middle + (u - middle + self._turn_px / 2) % self._turn_px - self._turn_px / 2
-        if round(self._turn_px) == self.size[0]:
+        u = middle + (u - middle + self._period_px / 2) % self._period_px - self._period_px / 2
+        if round(self._period_px) == self.size[0]:
             u = np.clip(u, 0.0, self.size[0] - 1.0)
         return np.column_stack([u, self.center[1] + self.focal[1] * elevation])
 

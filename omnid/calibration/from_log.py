@@ -178,7 +178,7 @@ class FixedParts:
     def __init__(self, cylinder: Cylinder) -> None:
         self._shape = cylinder.height, cylinder.width
         rows = max(1, round(cylinder.height * FOCAL_PX / cylinder.focal_px))
-        self._size = max(1, DIRECTIONS * cylinder.width // cylinder.turn_px), rows
+        self._size = max(1, DIRECTIONS * cylinder.width // cylinder.period_px), rows
         self._first_row = round((cylinder.row0 + MIN_FALL * cylinder.focal_px) * rows / cylinder.height)
         self._views: dict[int, Floats] = {}  # (2, rows, columns) of the lower and the upper panorama, by heading
         self._heading = -1  # of the pair before

@@ -141,7 +141,7 @@ class Dewarp:
                 self._pad_px,
                 gains[side] * self._noise_grey[side],
                 gains[side],
-                cylinder.turn_px,
+                cylinder.period_px,
                 cylinder.first,
                 raw[side][2],
                 cylinder.scale,

@@ -42,17 +42,17 @@ def test_a_sector_has_the_columns_of_what_both_cameras_see(
     camera = lens(model, field_deg, size)
     rig = lens_rig(camera, heading_deg=heading_deg)
     cylinder = fit_cylinder(rig)
-    span_deg = 360 * cylinder.width / cylinder.turn_px
+    span_deg = 360 * cylinder.width / cylinder.period_px
     assert field_deg - CORNERS_DEG < span_deg < field_deg + 2 * STEP_DEG + 8 * CORNERS_DEG
     middle = np.rad2deg(cylinder.azimuth(np.array([(cylinder.width - 1) / 2]))[0]) - heading_deg
     assert abs(math.remainder(middle, 360)) < STEP_DEG + CORNERS_DEG
     per_rad = np.linalg.norm(np.diff(camera.project(np.array([[-0.01, 0, 1], [0.01, 0, 1.0]])), axis=0)) / 0.02
     assert 0.7 * per_rad < cylinder.focal_px < 1.9 * per_rad
     # No column of what both see is missing.
-    wide = Cylinder(cylinder.turn_px, cylinder.height, cylinder.row0)
+    wide = Cylinder(cylinder.period_px, cylinder.height, cylinder.row0)
     both = np.logical_and(*(visible(m, remap_tables(rig, m, wide)) for m in (rig.lower, rig.upper)))
     missing = both.any(axis=0)
-    missing[(cylinder.first + np.arange(cylinder.width)) % cylinder.turn_px] = False
+    missing[(cylinder.first + np.arange(cylinder.width)) % cylinder.period_px] = False
     assert missing.mean() < 0.002
 
 

@@ -62,7 +62,7 @@ class Connection:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("drive", WIRINGS)
-def test_drives_the_commanded_arc_and_reports_it(name: str, drive: DifferentialDrive) -> None:
+def test_the_base_drives_the_commanded_arc_and_reports_it(name: str, drive: DifferentialDrive) -> None:
     connection = Connection(name, drive)
     connection.drive(1.0, 0.4, 0.5)
     before = connection.base.pose

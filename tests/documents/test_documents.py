@@ -147,7 +147,7 @@ def test_nav2_uses_topics_that_exist() -> None:
 NOTEBOOK = Path(__file__).parents[2] / "omnid" / "examples" / "first_replay.ipynb"
 
 
-def test_its_cells_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cells_of_the_notebook_run(monkeypatch: pytest.MonkeyPatch) -> None:
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
     names: dict[str, Any] = {}

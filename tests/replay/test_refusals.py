@@ -90,7 +90,7 @@ def test_uses_the_readable_part_of_a_truncated_log(omnid: Command, tmp_path: Pat
     assert len(rows(tum)) == result.count("pairs")
 
 
-def test_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_replay_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Path) -> None:
     bag, rig, settings = tmp_path / "bag", tmp_path / "rig.toml", tmp_path / "omnid.toml"
     bag.mkdir()
     shutil.copy(scene / "log.mcap", bag / "bag_0.mcap")

@@ -122,7 +122,7 @@ def test_uses_the_attached_rig_and_ends_with_the_log() -> None:
     assert daemon.process.returncode == 0 and "Traceback" not in err, err
 
 
-def test_a_signal_ends_it_without_output_at_any_time(scene: Path) -> None:
+def test_a_signal_ends_the_run_without_output_at_any_time(scene: Path) -> None:
     """Also while it starts."""
     port = free_port()
     words = ("--motor", "simulated", "--set", "obstacles.scan.floor_m=-1.2")
@@ -133,7 +133,7 @@ def test_a_signal_ends_it_without_output_at_any_time(scene: Path) -> None:
 
 
 @pytest.mark.hazard("H04")
-def test_waits_for_its_motor_and_cannot_be_armed_before_that_has_answered(tmp_path: Path, course: Path) -> None:
+def test_the_run_waits_for_the_motor_and_is_armed_only_after_the_answer(tmp_path: Path, course: Path) -> None:
     port, words = free_port(), patient('controller.arming="manual"', "motor.boot_s=0.5")
     with closing(Base(tmp_path)) as base:
         base.unplug()

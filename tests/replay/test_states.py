@@ -96,7 +96,7 @@ def test_images_without_texture_at_the_start(
     assert found[0] == "lost" and found[-1] == "tracking"
 
 
-def test_another_scene_after_the_darkness(omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path) -> None:
+def test_another_scene_after_the_dark(omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path) -> None:
     before, after = images(scene / "log.mcap"), images(elsewhere / "log.mcap")
     dark_images = [dark(p.later(1 + k)) for k in range(DARK_PAIRS) for p in before[:2]]
     log = save(tmp_path / "log.mcap", [*before[:2], *dark_images, *(p.later(1 + DARK_PAIRS) for p in after)])

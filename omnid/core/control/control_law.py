@@ -124,14 +124,14 @@ class ControllerState:
     stops: Counter[str] = field(default_factory=Counter)  # stops of wheels that turned, by reason
 
     @property
-    def held_by(self) -> str:
+    def blocked_by(self) -> str:
         """Why the collision monitor stops the base; empty: it does not."""
         return self.obstacle if self.blocked else ""
 
     @property
-    def is_held(self) -> bool:
-        """True if a safety rule stops the wheels now, and not only for want of a command."""
-        return self.reason not in ("", safety_rules.IDLE, safety_rules.COMMAND_STALE)
+    def stopping_rule(self) -> str:
+        """The safety rule that stops the wheels now; empty: none does, or only one for want of a command."""
+        return "" if self.reason in (safety_rules.IDLE, safety_rules.COMMAND_STALE) else self.reason
 
 
 class ControlOutput(NamedTuple):

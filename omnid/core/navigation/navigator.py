@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 PROGRESS_M, PROGRESS_RAD = SHORTEST_M / 2, math.radians(5)  # A smaller motion is no progress.
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
-LOOK_M: Final = 2.0  # Length of the way ahead that is searched for obstacles; twice that for a free place behind them.
+SEARCHED_AHEAD_M: Final = 2.0  # The way ahead is searched so far for obstacles, and twice that for a place behind.
 REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a detour ends.
 # Time between two searches for a way while the present one is blocked, and for a shorter one while it is free.
 AGAIN_NS, SHORTER_NS = 500_000_000, 2_000_000_000
@@ -146,7 +146,7 @@ class Navigation(NamedTuple):
     offset_m: float = math.nan  # distance of the base to the left of the path
 
 
-def held(drive: Drive, now: Situation, settings: NavigationSettings) -> tuple[NavigationState, str] | None:
+def interruption(drive: Drive, now: Situation, settings: NavigationSettings) -> tuple[NavigationState, str] | None:
     """Return the state and the reason of a drive that may not go on now, None of one that may.
 
     The first rule that holds decides: an end is final, everything else is waited for.
@@ -234,9 +234,9 @@ class Navigator:
             return answer
         # 1. Faults of wheels or pose, and other sources of commands.
         self._follow_map(drive, now)
-        hold = held(drive, now, settings)
-        if hold is not None:
-            return self._wait(drive, *hold, dt_s)
+        cause = interruption(drive, now, settings)
+        if cause is not None:
+            return self._wait(drive, *cause, dt_s)
         drive.resets = now.resets
         # 2. The way.
         following = drive.step(now, self._clearance_m(drive, now))
@@ -251,20 +251,20 @@ class Navigator:
             )
         if following.left_m < drive.least_m - NEARER_M:
             drive.least_m, drive.ways, drive.lost_s, drive.tried_s = following.left_m, 0, 0.0, 0.0
-        # 3. Obstacles on the way, and a safety rule that holds the wheels because of an obstacle.
+        # 3. Obstacles on the way, and a safety rule that stops the wheels because of an obstacle.
         following, obstacle = self._around_obstacles(drive, now, following)
-        if obstacle or now.wheels.held_by:  # Held wheels still get the motion: the monitor releases them.
-            return self._blocked(drive, obstacle, now.wheels.held_by, following, dt_s)
+        if obstacle or now.wheels.blocked_by:  # Stopped wheels still get the motion: the monitor releases them.
+            return self._blocked(drive, obstacle, now.wheels.blocked_by, following, dt_s)
         # 4. The drive fails after too long a time without progress.
         avoids = drive.detour is not None
         drive.advance(now, following.left_m, dt_s)
-        held_by = now.wheels.reason if now.wheels.is_held else ""
+        rule = now.wheels.stopping_rule
         if drive.stuck_s > settings.stuck_s:
-            why = held_by or (AROUND if avoids else "")
+            why = rule or (AROUND if avoids else "")
             parts = f"no progress for {settings.stuck_s:g} s", why, "look at the robot"
             return self._end(NavigationState.FAILED, ": ".join(part for part in parts if part))
         self.state = NavigationState.AVOIDING if avoids else NavigationState.DRIVING
-        self.reason, drive.waited_s = held_by, 0.0
+        self.reason, drive.waited_s = rule, 0.0
         return Navigation(following.setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _follow_map(self, drive: Drive, now: Situation) -> None:
@@ -308,10 +308,10 @@ class Navigator:
         pursuit, required_m = self.settings.pursuit, self._planner.required_m
         look = now.stamp_ns, pursuit.velocity_mps
         kept_m = required_m + (self.settings.clearance_m if drive.detour is None else 0.0)
-        first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), kept_m, *look)
+        first_m = around.first_blocked_m(drive.ahead(now, SEARCHED_AHEAD_M), kept_m, *look)
         if self._begin_other_way(drive, now, around, following, is_closed=first_m < math.inf):
             following = drive.step(now, self._clearance_m(drive, now))
-            first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), required_m, *look)
+            first_m = around.first_blocked_m(drive.ahead(now, SEARCHED_AHEAD_M), required_m, *look)
         # 2. Without another way, wait: on a blocked detour at once, on the path in front of the obstacle.
         wanted = following.setpoint
         left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
@@ -332,7 +332,7 @@ class Navigator:
         present way is free again, and so at most twice the least time is lost (the ski rental problem).
         """
         detour, settings, path = drive.detour, self.settings, drive.paths[0]
-        is_to_goal, is_blocked = detour is not None and path.is_goal, is_closed or bool(now.wheels.held_by)
+        is_to_goal, is_blocked = detour is not None and path.is_goal, is_closed or bool(now.wheels.blocked_by)
         if is_to_goal and not is_blocked:
             goal = drive.in_odom(path.goal[None], now)[0]
             if self._planner.is_straight_free(now.pose, goal, around, now.stamp_ns):
@@ -346,7 +346,7 @@ class Navigator:
         if is_blocked and detour is not None:
             drive.ways += drive.way_s * 1e9 > AGAIN_NS  # what was not driven was not tried
             drive.tried_s, drive.way_s = drive.tried_s + drive.way_s, 0.0
-        found = self._search(drive, now, around, drive.move if now.wheels.held_by else None)
+        found = self._search(drive, now, around, drive.move if now.wheels.blocked_by else None)
         if not isinstance(found, str) and is_blocked and drive.ways >= MOST_WAYS:
             found = f"{drive.ways} ways were tried"
         if isinstance(found, str):
@@ -355,7 +355,7 @@ class Navigator:
         drive.no_way = ""
         if is_blocked:
             may_leave = is_closed and (detour is None or around.has_moving)
-            worth_m = following.left_m + LOOK_M + settings.pursuit.velocity_mps * drive.lost_s
+            worth_m = following.left_m + SEARCHED_AHEAD_M + settings.pursuit.velocity_mps * drive.lost_s
             drive.is_waiting = may_leave and found.way.length_m > worth_m
             if drive.is_waiting:
                 return False
@@ -373,7 +373,7 @@ class Navigator:
         if path.is_goal:
             goal = drive.in_odom(path.goal[None], now)[0]
         else:
-            xy, places = drive.follower.ahead(2 * LOOK_M)
+            xy, places = drive.follower.ahead(2 * SEARCHED_AHEAD_M)
             corridor = drive.in_odom(xy, now)
             distances = around.distance_m if barred is None else around.closed_distance_m
             distance_m = around.path_distance_m(corridor, now.stamp_ns, settings.pursuit.velocity_mps, distances)
@@ -391,17 +391,17 @@ class Navigator:
             return found
         return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found, place)
 
-    def _blocked(self, drive: Drive, obstacle: str, held_by: str, following: Following, dt_s: float) -> Navigation:
+    def _blocked(self, drive: Drive, obstacle: str, blocked_by: str, following: Following, dt_s: float) -> Navigation:
         """Wait for a free way; fail if for too long none leads to a goal. Paths and routes never give up.
 
-        obstacle: on the way; empty: the collision monitor holds the base on a free one, by held_by.
+        obstacle: on the way; empty: the collision monitor stops the base on a free one, for blocked_by.
         """
         drive.lost_s += dt_s
         lost_s = drive.lost_s + (drive.tried_s if drive.no_way else 0.0)
         if drive.paths[0].is_goal and not drive.is_waiting and 0 < self.settings.give_up_s < lost_s:
-            why = (drive.no_way or obstacle) if obstacle else held_by
+            why = (drive.no_way or obstacle) if obstacle else blocked_by
             return self._end(NavigationState.FAILED, f"no way to the goal, {following.left_m:.1f} m are left: {why}")
-        self.state, self.reason = NavigationState.BLOCKED, f"{obstacle or held_by}: {WAITS}"
+        self.state, self.reason = NavigationState.BLOCKED, f"{obstacle or blocked_by}: {WAITS}"
         return Navigation(following.setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:

@@ -30,7 +30,7 @@ BACK_MPS: Final = 0.2  # slower than forwards, because people do not expect a ro
 MARGIN_M: Final = 0.2 * CELL_M  # room for errors of the grid and of the base on its way
 # Speed that is planned through floor that was not seen: a detour over floor that was is preferred up to 4 times as far.
 UNKNOWN_MPS: Final = 0.1
-LOOK_M: Final = 1.0  # An obstacle at the goal is seen well from this distance.
+GOAL_SEEN_M: Final = 1.0  # An obstacle at the goal is seen well from this distance.
 
 
 class Move(IntEnum):
@@ -122,7 +122,7 @@ class Planner:
         elif is_inside:
             # An obstacle seen from afar at the goal may be next to it: drive as near as is free, to see it better.
             least_m = float(away_m[is_open].min())
-            if math.dist(goal, pose[:2]) < least_m + LOOK_M:
+            if math.dist(goal, pose[:2]) < least_m + GOAL_SEEN_M:
                 return f"an obstacle is {around.closed_distance_m[row, column]:.1f} m from the goal"
             left_s[is_open & (away_m < least_m + 2 * CELL_M)] = 0.0
         elif along is None:

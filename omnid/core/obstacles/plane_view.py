@@ -154,7 +154,7 @@ class PlaneView:
         self._first_disparity = max(1, math.floor(self.at_1m / settings.max_range_m))  # that is compared
         # 1. Working panoramas. A sector has a whole number of directions (calib.panorama.SECTOR_STEPS); in the others
         #    nothing is seen.
-        by_column = DIRECTIONS / cylinder.turn_px
+        by_column = DIRECTIONS / cylinder.period_px
         self._shown = np.arange(round(by_column * cylinder.width)) + round(by_column * cylinder.first)
         self._shown %= DIRECTIONS
         self._shown_rows = round(cylinder.height * FOCAL_PX / cylinder.focal_px)

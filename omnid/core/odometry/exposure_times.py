@@ -139,7 +139,7 @@ class Exposure:
         shifts = [cylinder.wrap(views[:, 0] - shift.upper[:, 0] - grid[:, 0]) for views, shift in corrected]
         slope = (shifts[1] - shifts[0]) / (near[1] - near[0])
         whole = len(columns) * grid_px, len(rows) * grid_px
-        mode: Literal["wrap", "edge"] = "wrap" if cylinder.width == cylinder.turn_px else "edge"
+        mode: Literal["wrap", "edge"] = "wrap" if cylinder.width == cylinder.period_px else "edge"
         fields = [
             cv2.resize(np.nan_to_num(field).astype(np.float32).reshape(len(rows), len(columns)), whole)
             for field in (shifts[0] - slope * near[0], slope)

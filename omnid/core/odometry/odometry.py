@@ -259,7 +259,7 @@ class VisualOdometry:
         # 1. Whether many landmarks support the pose, or nearly all of few all around: they are no single moving thing.
         limits, at_previous = self._limits, None
         is_after_gap = self._refused_s is not None or now.dt_s > self._limits.max_gap_s
-        parts = np.unique(np.floor(estimate.pixels[:, 0] * (AROUND / self._model.cylinder.turn_px)) % AROUND)
+        parts = np.unique(np.floor(estimate.pixels[:, 0] * (AROUND / self._model.cylinder.period_px)) % AROUND)
         is_all = estimate.least_ratio >= NEARLY_ALL and len(parts) >= AROUND / 2
         is_sure = not self._other.is_open and (estimate.inliers >= limits.good_inliers or is_all)
         # 2. The filter, and the times of the rows.

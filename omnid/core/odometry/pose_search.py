@@ -82,7 +82,7 @@ class PoseSearch:
         before, now = self._map.last.panorama, frame.lower.panorama
         guesses = [
             se3.transform(T_last[:3, :3] @ se3.rotation_exp([0, 0, yaw_rad]), T_predicted[:3, 3])
-            for yaw_rad in correlation_peaks(before, now, frame.usable, turn_px=frame.lower.period_px)
+            for yaw_rad in correlation_peaks(before, now, frame.usable, period_px=frame.lower.period_px)
         ]
         tracks = [self._map.track(frame.lower, T_guess, max_count=LANDMARKS) for T_guess in guesses]
         return guesses[int(np.argmax([len(each.landmarks) / max(1, each.visible) for each in tracks]))]

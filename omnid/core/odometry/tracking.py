@@ -100,14 +100,14 @@ def normalised_patches(
     return np.asarray(patches / np.maximum(length, 1e-9)[:, None]), np.asarray(length / side)
 
 
-def correlation_peaks(before: Image, after: Image, usable: Flags, turn_px: int = 0) -> list[float]:
+def correlation_peaks(before: Image, after: Image, usable: Flags, period_px: int = 0) -> list[float]:
     """Return the likeliest turns to the left [rad] from one panorama (H, W) to the next, best first, in [-pi, pi).
 
     Circular correlation of the horizontal gradients over azimuth, exact at the seam because nothing is padded.
     Structure that is fixed to the rig must be left out by usable (H, W), because it holds the peak at zero.
-    turn_px: columns of a full turn, of which a sector shows only its own; 0: all are shown.
+    period_px: columns of a full turn, of which a sector shows only its own; 0: all are shown.
     """
-    width = turn_px or before.shape[1]
+    width = period_px or before.shape[1]
     spectrum = np.conj(_spectrum(before, usable, width)) * _spectrum(after, usable, width)
     score = np.fft.irfft(spectrum.sum(axis=0), width)
     apart = round(width * STEP_RAD / (4 * math.pi))
@@ -119,9 +119,9 @@ def correlation_peaks(before: Image, after: Image, usable: Flags, turn_px: int =
     return peaks
 
 
-def _spectrum(image: Image, usable: Flags, turn_px: int) -> NDArray[np.complex64]:
+def _spectrum(image: Image, usable: Flags, period_px: int) -> NDArray[np.complex64]:
     """Return the spectrum (H, turn / 2 + 1) over azimuth of the horizontal gradient."""
     wrapped = np.hstack([image[:, -1:], image, image[:, :1]])
     gradient = cv2.Sobel(wrapped, cv2.CV_32F, 1, 0)[:, 1:-1]
     limited = np.clip(gradient, -MAX_GRADIENT, MAX_GRADIENT) * usable
-    return np.fft.rfft(limited, turn_px, axis=1).astype(np.complex64)
+    return np.fft.rfft(limited, period_px, axis=1).astype(np.complex64)

@@ -242,4 +242,4 @@ class TileMonitor:
 
 def tile_columns(cylinder: Cylinder) -> int:
     """Return the number of columns of tiles of a panorama."""
-    return max(1, round(TILE_COLUMNS * cylinder.width / cylinder.turn_px))
+    return max(1, round(TILE_COLUMNS * cylinder.width / cylinder.period_px))

@@ -29,20 +29,19 @@ class PaddedPanorama:
     pad_px: int
     noise_grey: float = 1.0  # standard deviation of the noise, grey levels
     gain: float = 1.0  # factor that was applied because the image was dim
-    turn_px: int = 0  # columns of the full turn of which this is a sector; 0: this is a full turn
+    period_px: int = 0  # columns of a full turn, of which a sector has some; 0: all of them
     first: int = 0  # column of the full turn that is column 0
     jpeg_steps: Steps = ()  # of the quantisation of the image's JPEG, (): none
     scale: float = 1.0  # columns by those of the images' own resolution
+
+    def __post_init__(self) -> None:
+        if not self.period_px:
+            object.__setattr__(self, "period_px", self.width)
 
     @property
     def width(self) -> int:
         """Columns without the padding [px]."""
         return int(self.image.shape[1]) - 2 * self.pad_px
-
-    @property
-    def period_px(self) -> int:
-        """Columns of a full turn [px]."""
-        return self.turn_px or self.width
 
     @property
     def panorama(self) -> Image:

@@ -51,7 +51,7 @@ def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("turn_deg", [(-3.0, 2.0, 5.0), (0, 0, 0)])
-def test_estimates_and_corrects_a_rotation_about_every_axis(
+def test_a_rotation_about_every_axis_is_estimated_and_corrected(
     rig: Rig, around: Array, turn_deg: tuple[float, float, float]
 ) -> None:
     wrong = with_upper_rotated(rig, turn_deg)
@@ -78,7 +78,7 @@ def test_distinguishes_a_shifted_viewpoint_from_a_tilt(rig: Rig, around: Array) 
     assert np.linalg.norm(along[0] - along[1]) < 2e-4
 
 
-def test_is_robust_to_false_matches_and_sigmas_are_consistent(rig: Rig, around: Array) -> None:
+def test_the_fit_is_robust_to_false_matches_and_sigmas_are_consistent(rig: Rig, around: Array) -> None:
     wrong, misses = with_upper_rotated(rig, (0.3, -0.2, 0.4)), []
     for seed in range(30):
         rng = np.random.default_rng(seed)

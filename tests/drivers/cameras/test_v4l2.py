@@ -209,7 +209,7 @@ def test_automatic_modes_come_before_the_values_that_they_govern(
     assert written(camera, **fields) == expected
 
 
-def test_what_a_camera_lacks_is_needed_only_where_it_is_asked_for(camera: FakeCamera) -> None:
+def test_controls_that_a_camera_lacks_are_needed_only_where_they_are_set(camera: FakeCamera) -> None:
     camera.menu = (0, 1, 3)
     assert written(camera, auto_exposure="on")[0] == (AUTO_EXPOSURE, 0)
     del camera.controls[AUTO_GAIN], camera.controls[AUTO_EXPOSURE], camera.controls[EXPOSURE_MAY_SLOW]

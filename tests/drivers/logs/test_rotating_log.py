@@ -86,7 +86,7 @@ def test_a_closed_recording_takes_no_more_messages(bench: Callable[..., Bench]) 
 @pytest.mark.parametrize(
     "rotation", [replace(ROOMY, file_bytes=500_000), replace(ROOMY, file_s=50 * TICK_NS / 1e9)], ids=["size", "age"]
 )
-def test_starts_a_new_file_by_size_and_by_age(bench: Callable[..., Bench], rotation: RotationSettings) -> None:
+def test_a_new_file_begins_by_size_and_by_age(bench: Callable[..., Bench], rotation: RotationSettings) -> None:
     recording = bench(rotation)
     recording.write(200, size=10_000)
     recording.log.close()
@@ -171,7 +171,7 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     assert recording.state.messages == saved + whole + recording.state.lost
 
 
-def test_keeps_the_reserved_space_free_and_completes_the_file(small_disk: Path, bench: Callable[..., Bench]) -> None:
+def test_the_reserved_space_stays_free_and_the_file_is_completed(small_disk: Path, bench: Callable[..., Bench]) -> None:
     rotation = replace(ROOMY, file_bytes=2 * 10**6, free_bytes=10**6, sync_s=0.0)
     recording = bench(rotation, folder=small_disk / "log")
     recording.write(20, size=10_000)
@@ -217,7 +217,7 @@ def written(path: Path, entries: list[Entry], **options: object) -> Path:
 
 
 @pytest.mark.parametrize("compression", [CompressionType.LZ4, CompressionType.NONE])
-def test_rosbags_and_the_log_reader_read_it(tmp_path: Path, compression: CompressionType) -> None:
+def test_rosbags_and_the_log_reader_read_the_log(tmp_path: Path, compression: CompressionType) -> None:
     entries = [*pairs(30), Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)]
     path = written(tmp_path / "log.mcap", entries, compression=compression)
     with AnyReader([path]) as bag:

@@ -150,7 +150,7 @@ def wheels() -> Wheels:
     return Wheels()
 
 
-def test_poses_flow_once_it_is_ready(operator: GuestOperator) -> None:
+def test_poses_flow_once_the_service_is_ready(operator: GuestOperator) -> None:
     assert show("ActiveState") == "active"
     assert {pose.state for pose in operator.more(8)} == {"tracking"}
 

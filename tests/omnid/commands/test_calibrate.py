@@ -145,7 +145,7 @@ def test_images_without_a_board_are_one_line_and_exit_code_2(
         (["--board", "aprilgrid", "--tags", "6x6", "--tag-mm", "80", "--tag-spacing", "24"], "Kalibr's tagSpacing"),
     ],
 )
-def test_names_what_is_wrong_with_the_board(
+def test_the_error_names_what_is_wrong_with_the_board(
     words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["calibrate", "rig", str(tmp_path), *words, "-o", str(tmp_path / "rig.toml")]) == 2

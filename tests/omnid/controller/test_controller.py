@@ -132,7 +132,7 @@ def send_both(bench: Bench) -> None:
 
 
 @pytest.mark.hazard("H13")
-def test_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
+def test_the_base_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
     """At half of the limits, which it comes to within the deceleration, and back again."""
     speeds = [driving.last.velocity_mps]
     for state in ["degraded"] * 10 + ["tracking"] * 10:
@@ -147,7 +147,7 @@ def test_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
 
 
 @pytest.mark.hazard("H05")
-def test_stops_where_no_more_setpoints_come(driving: Bench) -> None:
+def test_the_base_stops_where_no_more_setpoints_come(driving: Bench) -> None:
     for _ in range(9):
         driving.send_pose()
         driving.tick()
@@ -169,7 +169,7 @@ def test_a_drive_that_ends_by_a_setpoint_to_stand_is_not_called_cut_short(drivin
 
 
 @pytest.mark.hazard("H40")
-def test_stops_on_an_overloaded_host_and_voids_earlier_setpoints(driving: Bench) -> None:
+def test_an_overloaded_host_stops_the_base_and_voids_earlier_setpoints(driving: Bench) -> None:
     send_both(driving)
     driving.tick(late_s=0.26)
     assert driving.controller.state.reason == safety_rules.OVERLOADED and driving.last.velocity_mps < 0.3
@@ -182,7 +182,7 @@ def test_stops_on_an_overloaded_host_and_voids_earlier_setpoints(driving: Bench)
     assert driving.statistics.lateness.max_s == pytest.approx(0.26)
 
 
-def test_drives_on_where_an_answer_is_late(driving: Bench) -> None:
+def test_the_base_drives_on_where_an_answer_is_late(driving: Bench) -> None:
     send = driving.wheels.send
 
     def late(_: VelocityCommand) -> MotorStatus:

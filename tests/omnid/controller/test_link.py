@@ -208,7 +208,7 @@ def test_survives_signals_that_end_the_daemon(robot: Robot, number: int) -> None
     wait_until(lambda: robot.link.statistics.state.sent > count + 5, "more ticks")
 
 
-def test_raises_where_the_process_was_killed(robot: Robot) -> None:
+def test_a_killed_process_raises_an_error(robot: Robot) -> None:
     robot.drive()
     os.kill(robot.pid, signal.SIGKILL)
     robot.joined()

@@ -224,7 +224,7 @@ def lost(first: int, last: int, *, is_dead: bool) -> TileStates:
     )
 
 
-def test_names_the_camera() -> None:
+def test_the_status_names_the_camera() -> None:
     assert entry(IMAGES, image_stats(None)).level == STALE
     found = entry(IMAGES, image_stats(update(lost(23, 40, is_dead=False), 113 * S)))
     assert found.level == ERROR and found.values == {Key.REMEDY: REMEDIES[IMAGES]}

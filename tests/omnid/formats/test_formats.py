@@ -114,7 +114,7 @@ def some_points(count: int) -> MapPoints:
 
 
 @pytest.mark.parametrize("count", [0, 1000])
-def test_reads_what_was_written(tmp_path: Path, count: int) -> None:
+def test_a_map_that_was_written_is_read_again(tmp_path: Path, count: int) -> None:
     path, points = tmp_path / "map.ply", some_points(count)
     write_ply(path, points)
     read = read_ply(path)

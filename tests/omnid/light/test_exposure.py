@@ -63,7 +63,7 @@ def test_brings_scenes_into_the_middle_and_rests(light: float, sensor: dict[str,
     assert all(b - a >= STEP_S for (a, _), (b, _) in pairwise(steps))
 
 
-def test_raises_the_exposure_to_its_limit_before_the_gain_and_lowers_the_gain_first() -> None:
+def test_the_exposure_rises_to_its_limit_before_the_gain_and_the_gain_falls_first() -> None:
     law = ExposureLaw(LAW_RANGES, START, 20_000)
     steps = [setting for _, setting in run(law, Sensor(0.05), 20.0)]
     first_gain = next(k for k, setting in enumerate(steps) if setting.gain)
@@ -157,7 +157,7 @@ def test_both_cameras_get_the_same_values_between_two_pairs(area: UsefulArea) ->
     assert int(status.values["steps"]) > 2 and robot.unequal == 0
 
 
-def test_says_when_it_is_too_dark_or_too_bright_and_what_to_do(area: UsefulArea) -> None:
+def test_the_status_says_what_to_do_where_it_is_too_dark_or_too_bright(area: UsefulArea) -> None:
     robot = Robot(area, 0.0)
     status = robot.drive(15.0)
     assert status.level == WARN and status.message.startswith("too dark") and "lights" in status.values["remedy"]
@@ -181,7 +181,7 @@ def test_leaves_the_exposure_to_the_cameras_and_says_why(
     assert all(state.exposure is None or state.exposure.request is None for state in robot.cameras.values())
 
 
-def test_gives_the_exposure_back_to_cameras_that_refuse_it(area: UsefulArea) -> None:
+def test_cameras_that_refuse_an_exposure_get_their_own_back(area: UsefulArea) -> None:
     robot = Robot(area, 0.3)
     robot.drive(1.0)
     exposure = robot.cameras["upper"].exposure

@@ -188,7 +188,7 @@ def test_a_refusal_names_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert "there is no route nowhere" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
 
 
-def test_a_scan_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
+def test_a_drive_waits_for_a_scan_but_not_for_an_old_one(tmp_path: Path) -> None:
     for age_ns, expected in ((0, NavigationState.BLOCKED), (3_000_000_000, NavigationState.DRIVING)):
         robot = Robot(tmp_path)
         robot.seq = 40

@@ -85,7 +85,7 @@ def test_pairs_frames_in_the_order_of_their_stamps(
     assert [p.seq for p in found] == list(range(len(stamps))) and unpaired(pair) == expected
 
 
-def test_pairs_again_after_a_camera_was_away(pair: Synchronise) -> None:
+def test_pairs_go_on_after_a_camera_was_away(pair: Synchronise) -> None:
     assert len(made(pair, shot("lower", 0), shot("upper", 0))) == 1
     assert made(pair, *(shot("upper", index) for index in range(1, 1000))) == []
     assert sum(unpaired(pair)) >= 999 - MAX_FRAMES, "few frames wait"

@@ -182,7 +182,7 @@ def test_a_taken_or_silent_endpoint_is_refused_with_the_setting_to_change() -> N
 
 
 @pytest.mark.hazard("H48")
-def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
+def test_a_robot_starts_disarmed_beside_one_of_the_same_name() -> None:
     router = free_endpoint()
     with script(ROUTER, router), contextlib.ExitStack() as stack:
 
@@ -367,7 +367,7 @@ def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:
             assert sender.ask(0.3) == "" and not commands, "it is for another robot"
 
 
-def test_nothing_else_stops_and_no_answer_is_longer_than_its_request() -> None:
+def test_other_datagrams_do_not_stop_and_answers_are_no_longer_than_requests() -> None:
     endpoint = free_endpoint()
     host, port = next(iter(addresses((endpoint,))))
     with (

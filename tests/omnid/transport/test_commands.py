@@ -329,7 +329,7 @@ def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands) -> None:
 
 
 @pytest.mark.hazard("H48")
-def test_is_not_armed_beside_a_robot_of_the_same_name() -> None:
+def test_a_robot_is_not_armed_beside_one_of_the_same_name() -> None:
     accepted = AcceptedCommands()
     accepted.is_unique = False
     accepted.receive("cmd/arm", arm())

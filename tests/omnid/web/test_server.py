@@ -245,7 +245,7 @@ def test_on_the_network_a_warning_says_that_the_token_can_be_read(tmp_path: Path
         assert code == 0 and "without encryption" in err and err.count("\n") == 1
 
 
-def test_a_signal_ends_it_with_pages_open() -> None:
+def test_a_signal_ends_the_server_with_pages_open() -> None:
     with served("--connect", free_endpoint()) as server, ThreadPoolExecutor(1) as threads:
         Shown(server).until("state")
         asking = threads.submit(lambda: [Shown(server).read() for _ in range(1000)])

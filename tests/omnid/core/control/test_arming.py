@@ -117,7 +117,7 @@ def test_every_fault_of_the_table_is_tested() -> None:
 
 
 @pytest.mark.hazard("H01")
-def test_is_disarmed_at_the_start(bench: Bench) -> None:
+def test_wheels_are_disarmed_at_the_start(bench: Bench) -> None:
     expect_stand(bench)
     assert bench.controller.state.reason == safety_rules.NOT_ARMED
     assert bench.controller.state.disarmed_by == STARTED and bench.controller.state.needs_request

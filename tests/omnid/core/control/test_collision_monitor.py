@@ -65,7 +65,7 @@ def after(
 
 @pytest.mark.hazard("H16")
 @pytest.mark.parametrize("point", [(0.39, 0.0), (0.3, 0.2), (0.26, -0.1), (0.2, 0.0)])
-def test_stops_before_an_obstacle_in_the_stop_polygon_and_lets_the_base_back_out(point: tuple[float, float]) -> None:
+def test_the_base_stops_before_an_obstacle_in_the_stop_polygon_and_may_back_out(point: tuple[float, float]) -> None:
     assert after(with_points(point)) == (Twist(), monitor_module.BLOCKED)
     allowed, _ = after(with_points(point), Twist(-0.3))
     assert allowed == Twist(-0.3)
@@ -85,7 +85,7 @@ def test_a_stopped_base_does_not_creep_on_when_the_scan_changes_by_a_cell() -> N
 
 
 @pytest.mark.hazard("H16")
-def test_drives_slowly_past_what_is_beside_its_way() -> None:
+def test_the_base_drives_slowly_past_an_obstacle_beside_the_way() -> None:
     allowed, reason = after(with_points((0.6, 0.3)))
     assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.NEAR
     assert after(with_points((0.6, 0.5))) == (AHEAD, "")
@@ -117,7 +117,7 @@ def test_a_long_base_turns_on_the_spot_as_far_as_floor_was_seen_beside_it() -> N
     assert slow.yaw_rate_radps == pytest.approx(0.2 / math.hypot(0.6, 0.22))
 
 
-def test_where_a_base_may_not_drive_it_may_turn_to_a_heading() -> None:
+def test_a_base_that_may_not_drive_may_turn_to_a_heading() -> None:
     monitor, arc = CollisionMonitor(SETTINGS, 1.5), Twist(0.3, -0.5)
     monitor.set_scan(ControllerScan(10 * S, with_points((0.38, 0.0))))
     assert monitor.step(10 * S, arc) == Twist()
@@ -247,7 +247,7 @@ def test_the_base_is_at_rest_before_a_person_beside_its_way_who_turns_towards_it
 
 
 @pytest.mark.hazard("H17")
-def test_a_new_one_slows_the_base_down_where_it_may_go() -> None:
+def test_a_new_moving_obstacle_slows_the_base_down_where_it_may_go() -> None:
     """Seen twice, it seems to walk beside the way; three looks make the sigma smaller than 0.4 m/s."""
     new = MovingPoint(1.0, 1.6, 0.0, -0.1, 0.2, 0.1, 0.6)
     allowed, reason = after(FREE_SCAN, moving=(new,))

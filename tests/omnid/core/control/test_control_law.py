@@ -102,7 +102,7 @@ def test_where_the_images_are_those_of_a_log_neither_motion_nor_obstacles_are_co
 # The safety rules: order, deadlines, and numbers that are not finite.
 
 
-def test_reports_the_first_of_two_causes_and_every_fault_disarms() -> None:
+def test_the_first_of_two_causes_is_reported_and_every_fault_disarms() -> None:
     reasons = list(safety_rules.RULES)
     assert len(set(reasons)) == len(reasons)
     for first, second in combinations(reasons, 2):
@@ -165,7 +165,7 @@ def test_the_first_sender_of_a_source_keeps_it_until_it_is_silent(selector: Comm
     assert selector.refused == {OTHER_SENDER: 11}
 
 
-def test_keeps_the_newest_of_reordered_commands(selector: CommandSelector) -> None:
+def test_the_newest_of_reordered_commands_is_kept(selector: CommandSelector) -> None:
     assert offer(selector, 1.0) and not offer(selector, 0.9)
     assert selector.current is not None and selector.current.arrival_ns == 10**12 + 10**9
 

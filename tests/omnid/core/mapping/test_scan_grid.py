@@ -120,7 +120,7 @@ def test_the_map_moves_when_a_loop_moves_its_keyframes() -> None:
     assert OCCUPIED in near(after, x, y)
 
 
-def test_it_grows_and_is_bounded() -> None:
+def test_the_grid_grows_and_is_bounded() -> None:
     grid = KeyframeGrid(0.05)
     nothing = grid.draw(of({}, np.zeros((0, 4, 4))), T_BASE_RECT)
     assert (nothing.cells == UNKNOWN).all()

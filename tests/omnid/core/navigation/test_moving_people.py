@@ -97,7 +97,7 @@ def test_a_person_who_crosses_is_let_pass_without_contact() -> None:
 
 @pytest.mark.hazard("H18")
 @pytest.mark.parametrize(("at_m", "begins_s"), [(4.6, 0.5), (3.4, 2.6), (3.4, 3.8), (1.2, 5.0)])
-def test_who_has_passed_before_or_comes_after_costs_little_time(at_m: float, begins_s: float) -> None:
+def test_a_person_who_has_passed_or_comes_later_costs_little_time(at_m: float, begins_s: float) -> None:
     base = BaseAmongPeople(4, (at_m, 1.9), (0.0, -0.9), begins_s)
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m > 0.1 and base.t_s < 25.0

@@ -88,7 +88,7 @@ def test_range_of_who_hides_the_nearest_floor_in_view_is_not_taken_for_a_stop() 
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_who_crosses_nearer_than_all_floor_in_view_is_as_near_as_a_person_of_that_angle(side: int) -> None:
+def test_a_person_nearer_than_all_floor_in_view_is_as_near_as_the_angle_says(side: int) -> None:
     """All floor in view, from 1.3 m on, is hidden over up to 60 degrees: 1.4 m there, a person 0.5 m away."""
     tracker, rng, speed_mps = MovingTracker(), np.random.default_rng(1), 1.2
     for i in range(16):
@@ -101,7 +101,7 @@ def test_who_crosses_nearer_than_all_floor_in_view_is_as_near_as_a_person_of_tha
             assert found[0].vy_mps * side == pytest.approx(-speed_mps, rel=0.35)
 
 
-def test_who_comes_out_from_behind_another_one_has_a_track_of_their_own() -> None:
+def test_a_person_who_comes_from_behind_another_has_a_new_track() -> None:
     """One walks away to a wall and stops there; the other one comes from there, 0.4 m beside, and is not the first."""
     rng, tracker, period_s = np.random.default_rng(1), MovingTracker(), 0.1
     found = []

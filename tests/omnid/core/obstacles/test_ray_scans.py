@@ -114,7 +114,7 @@ def test_a_base_may_begin_between_walls_nearer_than_the_floor_in_view(aside_m: f
 
 
 @pytest.mark.parametrize("floor", [plain, worn, stains])
-def test_what_hangs_is_where_it_is_seen(floor: Pattern) -> None:
+def test_a_hanging_bar_is_where_it_is_seen(floor: Pattern) -> None:
     """Cells around it, to which its evidence belongs as well, stay free."""
     scan = Standing(floor).scan(Bar(1.4, (0.5, 0.56)), pairs=20)
     assert scan.grid is not None
@@ -145,7 +145,7 @@ def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Patte
 @pytest.mark.hazard("H17")
 @pytest.mark.parametrize("floor", [plain, worn, stains])
 @pytest.mark.parametrize("ahead_m", [0.0, 0.3])
-def test_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern, ahead_m: float) -> None:
+def test_a_person_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern, ahead_m: float) -> None:
     """As wide as a person, and where the cameras see it; nothing else has come."""
     base = Standing(floor, ahead_m=ahead_m)
     assert np.isnan(base.scan(pairs=8).arrivals.ranges_m).all()
@@ -157,7 +157,7 @@ def test_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern, ahead_m
 
 
 @pytest.mark.hazard("H17")
-def test_who_hides_the_nearest_floor_in_view_may_be_anywhere_before_it() -> None:
+def test_an_obstacle_that_hides_the_nearest_floor_in_view_may_be_nearer() -> None:
     base = Standing(stains)
     base.scan(pairs=8)
     scan = base.scan(Pole(0.5, 0.4, 60.0))

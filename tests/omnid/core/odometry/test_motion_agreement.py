@@ -188,7 +188,7 @@ def test_a_gyro_that_turns_otherwise_is_named() -> None:
     assert fault.reason == GYRO_DIFFERS
 
 
-def test_once_all_have_stood_it_is_forgotten() -> None:
+def test_a_fault_is_forgotten_once_all_have_stood() -> None:
     """So that a person may arm and try again."""
     found = driven(Errors(images_scale=0.5), 12.0, turns=False, stops_s=6.0)
     assert found[58][1].is_fault

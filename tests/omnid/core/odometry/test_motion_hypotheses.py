@@ -62,7 +62,7 @@ def test_a_world_that_repeats_is_degraded_and_the_covariance_covers_all_motions(
         assert abs(error[0]) > 0.9 * PERIOD_M, "this world is to mislead"
 
 
-def test_wheels_tell_which_motion_it_was(alike: RenderedCameras) -> None:
+def test_wheels_decide_between_two_motions(alike: RenderedCameras) -> None:
     poses = ahead(4, STEP_M)
     for k, estimate in enumerate(driven(alike, poses, STEP_M / PERIOD_S)):
         assert estimate.state is TrackingState.TRACKING, k
@@ -75,7 +75,7 @@ def pose(x_m: float) -> PoseEstimate:
     return PoseEstimate(T, 1e-6 * np.eye(6), 100, 100, 100, np.arange(100), cost=0.1, in_view=100)
 
 
-def test_the_other_motion_goes_on_until_steps_without_its_peak_decide() -> None:
+def test_the_other_hypothesis_is_kept_until_steps_without_its_peak_decide() -> None:
     """Its displacements add up, and are forgotten where the published motion goes on as predicted."""
     other = OtherMotion()
 

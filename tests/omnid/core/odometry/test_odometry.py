@@ -67,7 +67,7 @@ def test_a_pose_that_one_camera_contradicts_is_refused(
     assert motion_errors(estimates[4].T_odom_rect, truth(4))[0] < 0.01
 
 
-def test_estimates_the_path_through_a_right_angle_and_its_own_error(
+def test_the_path_through_a_right_angle_and_its_error_are_estimated(
     odometry: VisualOdometry, frames: list[StereoFrame]
 ) -> None:
     for k, estimate in enumerate(run(odometry, frames)):

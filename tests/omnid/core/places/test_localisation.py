@@ -102,7 +102,7 @@ def test_loops_halve_the_error_and_odom_never_jumps(
     assert first * STEP_M < 3.0 + OUT[-1] / 2 + 1.0 + 1.0
 
 
-def test_carried_away_it_finds_itself_in_the_map_again(frames: list[StereoFrame], out: MapLocaliser) -> None:
+def test_a_robot_that_was_carried_away_is_localised_again(frames: list[StereoFrame], out: MapLocaliser) -> None:
     """After the reset odom is meaningless in the map until three frames agree."""
     localiser = deepcopy(out)
     there = list(range(len(OUT) + 8, len(OUT) + 14))

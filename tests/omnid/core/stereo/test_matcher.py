@@ -86,7 +86,7 @@ def test_leaves_out_pixels_without_a_match(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_finds_two_depths_side_by_side(method: str) -> None:
+def test_two_depths_side_by_side_are_found(method: str) -> None:
     """A near wall on the right, a far one on the left."""
     lower = texture(11, SHAPE)
     upper = np.where(np.arange(SHAPE[1]) < 120, np.roll(lower, 8, axis=0), np.roll(lower, 31, axis=0))

@@ -9,7 +9,7 @@ from omnid.core.types.panorama import PaddedPanorama
 PAD_PX, WIDTH = 8, 100
 IMAGE = np.tile(np.arange(WIDTH + 2 * PAD_PX, dtype=np.uint8), (5, 1))
 TURN = PaddedPanorama(IMAGE, PAD_PX)
-SECTOR = PaddedPanorama(IMAGE, PAD_PX, turn_px=360, first=300)
+SECTOR = PaddedPanorama(IMAGE, PAD_PX, period_px=360, first=300)
 COLUMNS = np.array([-3.0, 0.0, 99.5, 103.0])
 
 
