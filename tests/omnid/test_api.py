@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -196,14 +197,16 @@ def example(name: str, *words: object, cwd: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, check=True).stdout
 
 
-def test_the_example_of_images_runs(tmp_path: Path, scene: Path, pairs: list[Pair], result: omnid.RunResult) -> None:
-    for name, index in (("lower", 1), ("upper", 2)):
-        (tmp_path / name).mkdir()
-        for pair in pairs[:5]:
-            cv2.imwrite(str(tmp_path / name / f"{pair[0]}.png"), pair[index])
-    lines = example("images_to_poses", scene / "rig.toml", tmp_path, cwd=tmp_path).splitlines()
-    x_m, y_m = result.T_odom_rig[4, :2, 3]
-    assert len(lines) == 5 and f"tracking ({x_m:.3f}, {y_m:.3f}) m" in lines[4]
+def test_the_code_of_the_page_on_replays_runs(
+    tmp_path: Path, scene: Path, start: Path, pairs: list[Pair], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, file in (("log.mcap", start), ("rig.toml", scene / "rig.toml"), ("truth.tum", tmp_path / "est.txt")):
+        (tmp_path / name).symlink_to(file)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"pairs": pairs[:2]}
+    for code in re.findall("```python\n(.*?)```", (ROOT / "docs/replay.md").read_text("utf-8"), re.DOTALL):
+        exec(code, names)
+    assert len(names["points"]) > 100
 
 
 def test_the_example_of_the_geometry_runs(tmp_path: Path, scene: Path, pairs: list[Pair]) -> None:
