@@ -226,7 +226,8 @@ def import_pair(
 def parse_ocam(text: str, view: View = "mirror", name: str = "calib_results.txt") -> OcamCamera:
     """Parse the camera of a calib_results.txt's text; the inverse polynomial, of any length, is not used."""
     with within(f"{name}: "):
-        lines = _number_lines(text)
+        words = (line.partition("#")[0].replace(",", " ").split() for line in text.splitlines())
+        lines = [[float(word) for word in line] for line in words if line]
         lengths = [len(lines[0]) - 1 if lines else 0, *map(len, lines[-3:])]
         if len(lines) < 4 or lengths[1:] != [2, 3, 2] or lengths[0] != lines[0][0]:
             raise CalibError(
@@ -236,12 +237,6 @@ def parse_ocam(text: str, view: View = "mirror", name: str = "calib_results.txt"
         (row, column), (c, d, e), (height, width) = lines[-3:]
         require_image_size("image size", width, height)
         return OcamCamera(tuple(lines[0][1:]), (row, column), (c, d, e), (int(width), int(height)), view)
-
-
-def _number_lines(text: str) -> list[list[float]]:
-    """Return the numbers of each line that has any, without comments (#); ValueError for other words."""
-    words = (line.partition("#")[0].replace(",", " ").split() for line in text.splitlines())
-    return [[float(word) for word in line] for line in words if line]
 
 
 def straight_up(baseline_m: float) -> Array:

@@ -66,13 +66,10 @@ class RigCovariance:
 
     def select(self, names: Sequence[str]) -> RigCovariance:
         """Return the (marginal) covariance of some parameters, in their order; CalibError if one is not listed."""
-        chosen = [self._index(name) for name in names]
+        if unknown := [name for name in names if name not in self.names]:
+            raise CalibError(f"covariance: no parameter {unknown[0]!r}; it has {', '.join(self.names)}")
+        chosen = [self.names.index(name) for name in names]
         return RigCovariance(tuple(names), self.sigmas[chosen], self.correlation[np.ix_(chosen, chosen)])
-
-    def _index(self, name: str) -> int:
-        if name not in self.names:
-            raise CalibError(f"covariance: no parameter {name!r}; it has {', '.join(self.names)}")
-        return self.names.index(name)
 
 
 MIN_BASELINE_M = 1e-3  # Viewpoints that are closer would show no depth.

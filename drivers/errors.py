@@ -23,7 +23,3 @@ class RecordError(FrameDecodeError):
 def one_line(error: Exception) -> str:
     """Return an error of a library in one line of bounded length: it may quote a file, which may contain anything."""
     return " ".join(str(error).split())[:256] or type(error).__name__
-
-
-def ignore_event(level: int, text: str) -> None:
-    """Drop an event."""

@@ -10,11 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from drivers.frame import Frame
 from drivers.jpeg import Steps
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.motion_monitor import AGREE, Conflict
+from omnid.core.frames import BaseMotion, base_pose
 from omnid.core.mapping.scan_grid import Grid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.navigation.requests import TaughtRoute
@@ -95,6 +97,12 @@ class OdometryUpdate:
     def position(self) -> Array:
         """Position (3,) of the rig in odom, m: the last column of T_odom_rig."""
         return self.T_odom_rig[:3, 3]
+
+    def of_base(self, T_base_rig: Array) -> BaseMotion:
+        """Return the motion of the base that carries the rig."""
+        A = se3.adjoint(T_base_rig)
+        pose = base_pose(self.T_odom_rig, self.covariance, T_base_rig)
+        return BaseMotion(*pose, A @ self.velocity, A @ self.velocity_covariance @ A.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -101,7 +101,11 @@ def predicted_corners(grey: Grey, mappings: Sequence[LocalMapping], window: floa
 
     window: half side [squares]; a corner is not sought farther than that.
     """
-    to_image = _to_image(mappings)
+    own = np.array([mapping.coefficients for mapping in mappings])
+
+    def to_image(which: NDArray[np.intp], xy: Array) -> Array:
+        return np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ own[which])
+
     shift = _corner_shifts(grey, to_image, len(mappings), window)
     pixels = to_image(np.arange(len(mappings)), shift[:, None])[:, 0]
     return pixels, np.abs(shift).max(axis=1)
@@ -169,12 +173,6 @@ def refine_with_camera(
     refined = pixels.copy()
     refined[seen] = to_image(np.arange(len(seen)), shift[:, None])[:, 0]
     return refined
-
-
-def _to_image(mappings: Sequence[LocalMapping]) -> ToImage:
-    """Return local mappings as functions."""
-    own = np.array([mapping.coefficients for mapping in mappings])
-    return lambda which, xy: np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ own[which])
 
 
 def _corner_shifts(grey: Grey, to_image: ToImage, count: int, window: float) -> Array:

@@ -129,11 +129,6 @@ class RigParameters:
         return (*self.rig_names, *self.waves, *self.times)
 
     @property
-    def of_transform(self) -> slice:
-        """The steps of the transform between the cameras."""
-        return slice(len(self.rig_names) - len(TRANSFORM_NAMES), len(self.rig_names))
-
-    @property
     def values(self) -> Array:
         """Values (P,) at steps of 0, in the parameters' own units; those of the transform are 0 rad."""
         known = {UPPER_DELAY: self.rig.times.upper_delay_s, LINE_TIME: self.rig.times.line_time_s}
@@ -184,11 +179,10 @@ class RigParameters:
             times.upper_delay_s + own.get(UPPER_DELAY, 0.0), times.line_time_s + own.get(LINE_TIME, 0.0)
         )
 
-    def transform_steps(self, rig: Rig) -> Array:
-        """Return the steps (P,) that give this rig the transform between the cameras of another; all others are 0."""
-        steps = np.zeros(len(self.names))
-        steps[self.of_transform] = self.rig.moves_to(rig)[: len(TRANSFORM_NAMES)] / ANGLE_UNIT_RAD
-        return steps
+    def turned(self, turn: Array) -> Array:
+        """Return the steps (P,) that rotate the upper camera by a vector (3,) [rad]; all others are 0."""
+        known = dict(zip(TRANSFORM_NAMES, (turn / ANGLE_UNIT_RAD).tolist(), strict=False))
+        return np.array([known.get(name, 0.0) for name in self.names])
 
     def baseline(self, change: Array, covariance: Array) -> tuple[float, Array]:
         """Return the length of the baseline [m] and the covariance (Q + 1, Q + 1) of the rig's parameters and it.

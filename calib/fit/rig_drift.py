@@ -13,14 +13,13 @@ of the point. (Longuet-Higgins 1981. The length of the baseline is not observabl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calib import se3
 from calib.fit.least_squares import BEST_STEP, KERNEL_WIDTH, central_differences, robust_sigma
 from calib.models.camera import NEWTON_STEPS, Array
-from calib.rig import Rig
 
 # Points that count as one: neighbours share their texture, and so the error of the match, in all pairs that show it.
 # With 1, the rotation of right rigs is off by 1.1 to 3.8 sigma (rms of drives of development seeds, see
@@ -41,9 +40,9 @@ class RigDrift:
     points: int
 
     @property
-    def turn_sigma(self) -> Array:
-        """Return the standard deviations (3,) of the rotation [rad]."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[:3]))
+    def sigmas(self) -> Array:
+        """Return the standard deviations (5,) of turn and shift [rad]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def angle_sigma(self) -> float:
@@ -51,11 +50,6 @@ class RigDrift:
         angle = float(np.linalg.norm(self.turn))
         axis = self.turn / angle if angle > 0 else np.full(3, 3**-0.5)
         return float(np.sqrt(axis @ self.covariance[:3, :3] @ axis))
-
-    @property
-    def shift_sigma(self) -> Array:
-        """Return the standard deviations (2,) of the shift [rad]."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)[3:]))
 
 
 def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift:
@@ -85,11 +79,3 @@ def _residuals(x: Array, lower: Array, upper: Array) -> Array:
     turned = upper @ se3.rotation_exp(x[:3]).T
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(upper, axis=1)
     return np.asarray((normal * turned).sum(axis=1) / np.maximum(lengths, 1e-12))
-
-
-def apply_drift(rig: Rig, drift: RigDrift) -> Rig:
-    """Return the rig with its upper camera rotated and shifted by the drift; the length of the baseline is kept.
-
-    The covariance is left out: that of the former calibration does not describe the new transform.
-    """
-    return replace(rig.with_upper_moved(drift.turn, drift.shift), covariance=None)

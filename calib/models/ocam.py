@@ -209,8 +209,3 @@ class OcamCamera:
 def project_near(camera: OmniCamera, points: Array) -> Array:
     """Return pixels (N, 2) of points (N, 3) [m] at their own distances, by a camera of any model."""
     return camera.project_near(points) if isinstance(camera, OcamCamera) else camera.project(points)
-
-
-def has_wavefront(camera: OmniCamera) -> bool:
-    """True if a camera's rays do not meet in one point."""
-    return isinstance(camera, OcamCamera) and any(camera.wavefront)

@@ -22,7 +22,7 @@ from drivers.cameras.v4l2_device import (
     follow_request,
 )
 from drivers.cameras.v4l2_ioctl import BufferFlag, Int32, V4l2Buffer
-from drivers.errors import DriverError, EventCallback, ignore_event
+from drivers.errors import DriverError, EventCallback
 from drivers.frame import Camera, Frame
 
 POLL_S: Final = 0.1  # longest wait until `close` is noticed
@@ -37,7 +37,7 @@ class V4l2Camera:
     settings until it is back. `state` may be read from any thread.
     """
 
-    def __init__(self, settings: V4l2Settings, camera: Camera, *, on_event: EventCallback = ignore_event) -> None:
+    def __init__(self, settings: V4l2Settings, camera: Camera, *, on_event: EventCallback) -> None:
         self._streams = deque([V4l2Stream(settings)])  # at most one; the thread that pops it closes it
         self.state = CameraState(mode=str(self._streams[0].image))
         fd = self._streams[0].fd

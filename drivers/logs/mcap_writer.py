@@ -15,7 +15,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import Literal
@@ -143,7 +142,8 @@ class LogWriter:
     def _channel(self, topic: str, schema_name: str) -> int:
         """Return the channel of a topic and a type."""
         if (topic, schema_name) not in self._channels:
-            schema = self._writer.register_schema(schema_name, "ros2msg", _schema_text(schema_name).encode())
+            text = typestore(Stores.ROS2_HUMBLE).generate_msgdef(schema_name, ros_version=2)[0]  # with all its parts
+            schema = self._writer.register_schema(schema_name, "ros2msg", text.encode())
             metadata = {"offered_qos_profiles": _TRANSIENT_LOCAL if topic == "/tf_static" else ""}
             self._channels[topic, schema_name] = self._writer.register_channel(topic, "cdr", schema, metadata)
         return self._channels[topic, schema_name]
@@ -151,12 +151,6 @@ class LogWriter:
     def _note_persisted(self) -> None:
         self._file.flush()
         self.size_bytes, self.persisted = self._file.tell(), self.messages
-
-
-@cache
-def _schema_text(schema_name: str) -> str:
-    """Return the definition of a ROS 2 type and of all its parts."""
-    return typestore(Stores.ROS2_HUMBLE).generate_msgdef(schema_name, ros_version=2)[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,21 +51,23 @@ class SimulatedBase:
         """Advance watchdog, wheels and pose by dt_s."""
         steps = math.ceil(dt_s / STEP_S)
         for _ in range(steps):
-            self.watch(dt_s / steps)
             self._step(dt_s / steps)
 
-    def watch(self, dt_s: float) -> None:
-        """Advance the watchdog by dt_s."""
+    def _step(self, dt_s: float) -> None:
+        # 1. The watchdog.
         self._since_command_s += dt_s
         if self._since_command_s * 1000 > self.watchdog_ms:
             self.watchdog_expired, self.commanded_mps = True, [0.0, 0.0]
-
-    def _step(self, dt_s: float) -> None:
+        # 2. The speeds; the yaw rate towards the goal heading, if there is one and the base does not stop.
         velocity_mps, yaw_rate_radps = self._twist(*self.commanded_mps)
         limits = self.limits
+        if self.goal_heading_rad is not None and self.commanded_mps != [0.0, 0.0]:
+            error_rad = math.remainder(self.goal_heading_rad - self.pose[2], math.tau)
+            yaw_rate_radps = limits.heading_gain_hz * error_rad
         self.velocity_mps += self._step_to(velocity_mps - self.velocity_mps, limits.acceleration_mps2, dt_s)
-        wanted_radps = _clamp(self._yaw_rate_to_goal(yaw_rate_radps), limits.yaw_rate_radps)
+        wanted_radps = _clamp(yaw_rate_radps, limits.yaw_rate_radps)
         self.yaw_rate_radps += self._step_to(wanted_radps - self.yaw_rate_radps, limits.yaw_acceleration_radps2, dt_s)
+        # 3. The pose.
         self._move(dt_s)
 
     def _step_to(self, difference: float, acceleration: float, dt_s: float) -> float:
@@ -74,12 +76,6 @@ class SimulatedBase:
         if lag_s and abs(difference) > REACHED:
             difference *= 1.0 - math.exp(-dt_s / lag_s)
         return _clamp(difference, acceleration * dt_s)
-
-    def _yaw_rate_to_goal(self, yaw_rate_radps: float) -> float:
-        """Return the yaw rate towards the goal heading; the commanded one without a goal, or where the base stops."""
-        if self.goal_heading_rad is None or self.commanded_mps == [0.0, 0.0]:
-            return yaw_rate_radps
-        return self.limits.heading_gain_hz * math.remainder(self.goal_heading_rad - self.pose[2], math.tau)
 
     def _move(self, dt_s: float) -> None:
         """Move the pose along the chord of the arc that the wheels travel over the ground."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.fit.least_squares import ROUNDS
 from calib.fit.parameters import TIMES, RigParameters
-from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_from_drive import (
     CORRELATED_OBSERVATIONS,
     DriveAdjustment,
@@ -20,7 +19,7 @@ from calib.fit.rig_from_drive import (
 )
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.camera import Array
-from calib.models.ocam import has_wavefront
+from calib.models.ocam import OcamCamera
 from calib.rig import Rig, RigCovariance
 from calib.rig_file import read_rig
 from calib.validation import LineReporter, silent
@@ -74,7 +73,8 @@ def calibrate_drive(
     #    lengths of other drives less well.
     cameras = LogCameras(*topics)
     before = with_masks(log, rig, cameras)
-    waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
+    cameras_before = (before.lower.camera, before.upper.camera)
+    waves = any(isinstance(camera, OcamCamera) and any(camera.wavefront) for camera in cameras_before)
     parameters = RigParameters.about(before, DISTORTION, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
     steps = straightened(log, parameters, cameras, progress)
@@ -109,7 +109,7 @@ def straightened(log: Path, parameters: RigParameters, cameras: LogCameras, prog
         )
     # Errors of a centre, and the motion between two exposures, have the effect of a shifted viewpoint, so only the
     # rotation is a start.
-    return parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
+    return parameters.turned(finding.drift.turn)
 
 
 def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:

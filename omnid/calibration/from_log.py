@@ -37,7 +37,6 @@ from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.floor import Floor, common_floor
-from omnid.core.frames import of_base
 from omnid.core.obstacles.plane_view import AROUND_ROWS, DIRECTIONS, FOCAL_PX, TEXTURE_SHARE
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.errors import OmnidError
@@ -144,7 +143,7 @@ def calibrate_mask(
         for update in tracked_updates(reader, front_end, log):
             pair = update.depth.panoramas
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:
-                parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
+                parts.observe(update.of_base(place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
             front_end.complete()
     if parts.headings < MIN_HEADINGS:
         raise OmnidError(

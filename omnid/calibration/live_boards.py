@@ -11,7 +11,6 @@ from enum import StrEnum
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.boards.board import AnyBoard
 from calib.models.camera import Array
@@ -50,8 +49,10 @@ class CameraCoverage:
         """Count a view with corners at pixels (N, 2), those that are not known NaN."""
         offset = pixels[np.isfinite(pixels[:, 0])] - np.array(self.shape[::-1]) / 2
         ring = (np.hypot(*offset.T) / self.radius_px * RINGS).astype(int)
+        clockwise = np.arctan2(offset[:, 0], -offset[:, 1]) / (2 * math.pi)  # v points down
+        hours = np.round(clockwise * HOURS).astype(int) % HOURS
         seen = np.zeros((RINGS, HOURS), bool)
-        seen[np.minimum(ring, RINGS - 1), hours_of(offset)] = True
+        seen[np.minimum(ring, RINGS - 1), hours] = True
         self.counts += seen
 
     def missing(self) -> list[str]:
@@ -62,12 +63,6 @@ class CameraCoverage:
         if (np.count_nonzero(self.counts, axis=1) >= HOURS // 2).sum() < 2:
             found.append("one ring only: hold it nearer, farther, higher, lower")
         return found
-
-
-def hours_of(offset: Array) -> NDArray[np.int64]:
-    """Return the hours (N,) of offsets (N, 2) px from the centre of an image, 0 at 12 o'clock; v points down."""
-    clockwise = np.arctan2(offset[:, 0], -offset[:, 1]) / (2 * math.pi)
-    return np.round(clockwise * HOURS).astype(np.int64) % HOURS
 
 
 def moved(a: Array | None, b: Array | None) -> float:

@@ -259,10 +259,6 @@ def print_entries(entries: Mapping[str, object]) -> None:
 
 def print_json(value: object) -> None:
     """Print dataclasses, mappings, sequences and numbers; a number that is not finite becomes null."""
-    text = msgspec.json.format(msgspec.json.encode(value, enc_hook=_of_json), indent=2).decode()
-    print(text)
-
-
-def _of_json(value: object) -> object:
-    """Return what JSON has for a mapping that is no dict, and for a path."""
-    return dict(value) if isinstance(value, Mapping) else str(value)
+    # JSON has neither mappings that are no dict, nor paths.
+    encoded = msgspec.json.encode(value, enc_hook=lambda one: dict(one) if isinstance(one, Mapping) else str(one))
+    print(msgspec.json.format(encoded, indent=2).decode())

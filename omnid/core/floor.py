@@ -78,13 +78,6 @@ class Floor(NamedTuple):
         return se3.transform(R, np.array([0.0, 0.0, self.height_m * up[2] - up @ view]))
 
 
-class _Points(NamedTuple):
-    """Points that may lie on the floor, about the viewpoint."""
-
-    xyz: Array  # (N, 3) m
-    sigma_m: Array  # (N,) along z
-
-
 class FloorFit(NamedTuple):
     """The floor of one pair, and the evidence for it."""
 
@@ -98,36 +91,36 @@ def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
     variance_m2 (N,): along the rays.
     """
     # 1. The points far enough below the horizon, and their noise along z.
-    seen = _usable(points, variance_m2)
-    if len(seen.xyz) < SECTORS:
+    xyz, sigma_m = _usable(points, variance_m2)
+    if len(xyz) < SECTORS:
         return None
     # 2. The likeliest height of a level floor; its tilt is noise that grows with the range.
-    across = np.hypot(seen.xyz[:, 0], seen.xyz[:, 1])
+    across = np.hypot(xyz[:, 0], xyz[:, 1])
     heights_m = HEIGHTS_M[:, None]
-    on, off = _densities(seen.xyz[:, 2] + heights_m, np.hypot(seen.sigma_m, TILT_SIGMA_RAD * across), heights_m)
+    on, off = _densities(xyz[:, 2] + heights_m, np.hypot(sigma_m, TILT_SIGMA_RAD * across), heights_m)
     best = np.log(FIRST_PART * on + (1 - FIRST_PART) * off).sum(axis=1).argmax()
     # 3. Height, tilt, part on the floor and noise, by the points about the floor.
-    A = np.column_stack([-np.ones(len(across)), seen.xyz[:, :2]])
+    A = np.column_stack([-np.ones(len(across)), xyz[:, :2]])
     q, part, scale = np.array([HEIGHTS_M[best], 0.0, 0.0]), FIRST_PART, 1.0
     prior = np.diag([0.0, TILT_SIGMA_RAD**-2, TILT_SIGMA_RAD**-2])
     for _ in range(ITERATIONS):
-        e = seen.xyz[:, 2] - A @ q
+        e = xyz[:, 2] - A @ q
         near = np.abs(e) < SPAN_M
-        on, off = _densities(e, scale * seen.sigma_m, SPAN_M)
+        on, off = _densities(e, scale * sigma_m, SPAN_M)
         share = np.where(near, part * on / (part * on + (1 - part) * off), 0.0)
-        weight = share / (scale * seen.sigma_m) ** 2 / CORRELATED_POINTS
+        weight = share / (scale * sigma_m) ** 2 / CORRELATED_POINTS
         information = A.T @ (weight[:, None] * A) + prior
         total, before = float(share.sum()), q
         if total < 1.0:
             return None
-        q = np.linalg.solve(information, A.T @ (weight * seen.xyz[:, 2]))
+        q = np.linalg.solve(information, A.T @ (weight * xyz[:, 2]))
         part = total / int(near.sum())
-        scale = float(np.clip(math.sqrt(share @ ((seen.xyz[:, 2] - A @ q) / seen.sigma_m) ** 2 / total), *NOISE_SCALES))
+        scale = float(np.clip(math.sqrt(share @ ((xyz[:, 2] - A @ q) / sigma_m) ** 2 / total), *NOISE_SCALES))
         if np.abs(q - before).max() < CONVERGED:
             break
     # 4. The evidence, and the directions in which the floor is seen.
     evidence = float(np.log((part * on + (1 - part) * off) / off)[near].sum()) / CORRELATED_POINTS
-    x, y = seen.xyz[share > 0.5, :2].T
+    x, y = xyz[share > 0.5, :2].T
     sectors = len(np.unique(np.floor(np.arctan2(y, x) * (SECTORS / (2 * math.pi)))))
     if evidence < MIN_PAIR_EVIDENCE or sectors < MIN_SECTORS or q[0] < HEIGHTS_M[0]:
         return None
@@ -161,12 +154,12 @@ def common_floor(pairs: Iterable[tuple[Array, Array]]) -> Floor | None:
     return Floor(height_m, a, b, math.hypot(sigma_m, scatter[0]), math.hypot(sigma_rad, scatter[1:3].max()))
 
 
-def _usable(points: Array, variance_m2: Array) -> _Points:
-    """Return the points below the horizon whose noise is small enough, at most MAX_POINTS."""
+def _usable(points: Array, variance_m2: Array) -> tuple[Array, Array]:
+    """Return the points (N, 3) below the horizon, at most MAX_POINTS, and their noise along z (N,), which is small."""
     across, fall = np.hypot(points[:, 0], points[:, 1]), -points[:, 2]
     steep = (fall > HEIGHTS_M[0]) & (fall > STEEP * across)
     xyz, fall, across = points[steep], fall[steep], across[steep]
     sigma = np.hypot(np.sqrt(variance_m2[steep]) * fall / np.hypot(across, fall), UNEVEN_M)
     kept = np.flatnonzero(sigma < LARGEST_SIGMA_M)  # False for NaN
     kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
-    return _Points(xyz[kept], sigma[kept])
+    return xyz[kept], sigma[kept]

@@ -12,7 +12,7 @@ the axes of a; it is converted where a message is encoded: `in_outer_axes`.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +20,6 @@ from numpy.typing import NDArray
 from calib import se3
 
 Array = NDArray[np.float64]
-
-
-class RigMotion(Protocol):
-    """Pose and velocity of the rig, as odometry publishes them."""
-
-    @property
-    def T_odom_rig(self) -> Array:
-        """Pose (4, 4)."""
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance (6, 6) [t; r] of the pose in the axes of the rig."""
-
-    @property
-    def velocity(self) -> Array:
-        """Velocity (6,) [m/s; rad/s] in the rig frame."""
-
-    @property
-    def velocity_covariance(self) -> Array:
-        """Covariance (6, 6) of the velocity."""
 
 
 class BaseMotion(NamedTuple):
@@ -56,13 +36,6 @@ def in_outer_axes(T_a_b: Array, covariance: Array) -> Array:
     R = np.zeros((6, 6))
     R[:3, :3] = R[3:, 3:] = T_a_b[:3, :3]
     return np.asarray(R @ covariance @ R.T)
-
-
-def of_base(motion: RigMotion, T_base_rig: Array) -> BaseMotion:
-    """Return the motion of the base that carries the rig."""
-    A = se3.adjoint(T_base_rig)
-    T_odom_base, covariance = base_pose(motion.T_odom_rig, motion.covariance, T_base_rig)
-    return BaseMotion(T_odom_base, covariance, A @ motion.velocity, A @ motion.velocity_covariance @ A.T)
 
 
 def base_pose(T_odom_rig: Array, covariance: Array, T_base_rig: Array) -> tuple[Array, Array]:

@@ -263,7 +263,7 @@ class StatusCollector:
             ),
             "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them": pairs_hz == 0,
         }
-        return stats | {"_warning": next((words for words, is_so in warnings.items() if is_so), "")}
+        return stats | {"_warning": next((words for words, applies in warnings.items() if applies), "")}
 
     def _camera(self, name: Camera) -> Stats:
         state, age_s = self._cameras[name], self._age_s(self._pair.newest_ns[name])

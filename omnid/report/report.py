@@ -71,7 +71,7 @@ def _head(run: RecordedRun) -> list[str]:
     return [
         f"<h1>Run of {escape(run.robot)}</h1><p class='sub'>{escape(source)}</p>",
         f"<div class='numbers'>{cells}</div>",
-        *(f"<p class='warn'>{escape(line)}</p>" for line, is_so in lines.items() if is_so),
+        *(f"<p class='warn'>{escape(line)}</p>" for line, applies in lines.items() if applies),
     ]
 
 

@@ -22,7 +22,6 @@ from omnid.config import Config
 from omnid.core.control.arming import PLANNER, ArmRequest, TimedSetpoint
 from omnid.core.control.control_law import ControllerState
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.frames import of_base
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
 from omnid.engine.graph import Graph, no_op
@@ -171,7 +170,7 @@ def simulate(
 
     def take_pose(odometry: OdometryUpdate) -> None:
         newest.append(odometry)
-        estimate = of_base(odometry, rig.T_base_rig)[0], odometry.state, front_end.motion.is_slipping
+        estimate = odometry.of_base(rig.T_base_rig)[0], odometry.state, front_end.motion.is_slipping
         run.poses.append(EstimatedPose(odometry.stamp_ns, truth[odometry.stamp_ns], *estimate))
         body.post(controller_pose(odometry, rig.T_base_rig))
 

@@ -14,7 +14,6 @@ from omnid.controller.link import DriveLink
 from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerState
 from omnid.core.control.safety_rules import AWAITED
-from omnid.core.frames import of_base
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate
 from omnid.navigation_state import with_reason
@@ -73,7 +72,7 @@ def navigation_answers(update: NavigationUpdate) -> Answers | None:
 
 def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -> ControllerPose:
     """Return the part of a pose that the controller needs; one that is not finite is LOST."""
-    T_odom_base, _, velocity, covariance = of_base(odometry, T_base_rig)
+    T_odom_base, _, velocity, covariance = odometry.of_base(T_base_rig)
     heading_rad, velocity_mps, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[0]), float(velocity[5])
     # NaN must come first: `max` returns its first argument then.
     sigma_mps, sigma_radps = (math.sqrt(max(float(covariance[axis, axis]), 0.0)) for axis in (0, 5))

@@ -15,7 +15,7 @@ from calib.rig import Rig
 from drivers.frame import Frame
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
-from omnid.core.frames import base_pose, in_outer_axes, of_base
+from omnid.core.frames import base_pose, in_outer_axes
 from omnid.core.mapping.voxel_map import ThinnedPath
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
@@ -135,7 +135,7 @@ class Encoder:
             status = DiagnosticStatus.of(ODOMETRY, level, odometry.state, values)
             yield _on("status", codec.diagnostics_cdr(stamp_ns, [status]))
         # 2. The pose and its transform.
-        T_odom_base, covariance, velocity, velocity_covariance = of_base(odometry, self.T_base_rig)
+        T_odom_base, covariance, velocity, velocity_covariance = odometry.of_base(self.T_base_rig)
         covariance = in_outer_axes(T_odom_base, covariance)
         yield _on("odom", codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity, velocity_covariance))
         yield _on("pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base))

@@ -12,7 +12,7 @@ from calib import se3
 from calib.se2_arrays import planar
 from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.control_law import ControllerState
-from omnid.core.frames import base_pose, in_outer_axes, of_base
+from omnid.core.frames import base_pose, in_outer_axes
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
@@ -117,7 +117,7 @@ class NavigationStage:
             self._in_map, self._reset_ns = None, odometry.stamp_ns
             self._scan = self._around = None
         # 2. Collect the pose of the base and its surroundings.
-        T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
+        T_odom_base, _, velocity, _ = odometry.of_base(self._T_base_rig)
         self._now = now = Situation(
             odometry.stamp_ns,
             planar(T_odom_base),

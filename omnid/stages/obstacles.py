@@ -15,7 +15,6 @@ from calib.panorama import Cylinder
 from calib.rig import Rig
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
-from omnid.core import frames
 from omnid.core.control.collision_monitor import ControllerScan, MovingPoint
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
@@ -102,7 +101,7 @@ class Obstacles:
         if has_reset or is_lost:
             self._tracker = MovingTracker()
         panoramas = odometry.depth.panoramas
-        T_odom_base = frames.of_base(odometry, self._geometry.rig.T_base_rig)[0]
+        T_odom_base = odometry.of_base(self._geometry.rig.T_base_rig)[0]
         tiles, cylinder = panoramas.tiles, self._geometry.cylinder
         unobserved = sectors_of(tiles.unknown, cylinder, self._T_base_rect, self._ranges_m)
         unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unobserved)

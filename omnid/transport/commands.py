@@ -178,9 +178,8 @@ class CommandReceiver:
 
     def receive(self, request: Request) -> Answer | None:
         """Handle one message; return the refusal, None where there is none or the target answers."""
-        arrival_ns = (
-            self._freshness.clock.monotonic_ns()
-        )  # before anything else: a stop that arrives meanwhile voids a command
+        # The arrival is read before anything else: a stop that arrives meanwhile voids a command.
+        arrival_ns = self._freshness.clock.monotonic_ns()
         counts = self._counts.get(request.topic, self.wheels)
         try:
             if (action := self._actions.get(request.topic)) is None:

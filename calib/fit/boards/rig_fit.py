@@ -87,11 +87,6 @@ class RigCalibration:
         return self.fit.covariance[first : first + len(TWIST_NAMES), first : first + len(TWIST_NAMES)]
 
     @property
-    def motion_sigma(self) -> Array:
-        """Return the standard deviations (6,) of T_upper_lower."""
-        return np.sqrt(np.maximum(0, np.diag(self.motion_covariance)))
-
-    @property
     def baseline_sigma_m(self) -> float:
         """Return the standard deviation of the distance of the viewpoints [m]."""
         along = se3.t_of(self.T_upper_lower) / self.baseline_m
@@ -130,7 +125,9 @@ def calibrate_boards(
         where = f"{SIDES[side]} camera: " if len(sizes) > 1 else ""
         rejected += [RejectedView(bad.name, where + bad.reason) for bad in found.rejected]
         bad_names = {bad.name for bad in found.rejected}
-        views = [_without(one, side) if one.name in bad_names else one for one in views]
+        for k, one in enumerate(views):
+            if one.name in bad_names:
+                views[k] = replace(one, seen=(*one.seen[:side], None, *one.seen[side + 1 :]))
         views = [one for one in views if one.is_seen]
     # 2. The transform between the cameras, and all together.
     if len(sizes) == 1:
@@ -254,11 +251,6 @@ def _pixels(views: Sequence[PairView], board: AnyBoard) -> Array:
 def _pairs(views: Sequence[PairView]) -> int:
     """Return the number of instants at which all cameras saw the board."""
     return sum(all(seen is not None for seen in view.seen) for view in views)
-
-
-def _without(view: PairView, side: int) -> PairView:
-    """Return the views of an instant without that of a camera."""
-    return replace(view, seen=tuple(None if k == side else own for k, own in enumerate(view.seen)))
 
 
 def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:

@@ -54,7 +54,11 @@ class ODriveAscii:
         Raises DriverError where another time is in force, or an axis has an error other than its watchdog's.
         """
         self._disarmed = True
-        lines = [line for axis in (0, 1) for line in _setup(axis, watchdog_ms / 1000)]
+        lines = list[str]()
+        for axis in (0, 1):  # The watchdog's timeout is set, and fed, before it is enabled.
+            config = f"w axis{axis}.config"
+            lines += [f"{config}.enable_watchdog 0", f"{config}.watchdog_timeout {watchdog_ms / 1000:g}"]
+            lines += [f"u {axis}", f"{config}.enable_watchdog 1"]
         properties = ("config.enable_watchdog", "config.watchdog_timeout", "error")
         replies = yield from self._query(lines, [f"r axis{axis}.{name}" for axis in (0, 1) for name in properties])
         for enabled, timeout, error in zip(*[iter(replies)] * len(properties), strict=True):
@@ -68,8 +72,9 @@ class ODriveAscii:
         arming = self._disarmed and is_stop(command)
         speeds = self._drive.channels(command)
         lines = [f"v {axis} {mps * self._drive.turns_per_m:.5f}" for axis, mps in enumerate(speeds)]
-        if arming:
-            lines += [line for axis in (0, 1) for line in _arming(axis)]
+        for axis in (0, 1) if arming else ():  # Clear its errors, and start closed-loop velocity control.
+            lines += [f"w axis{axis}.controller.config.control_mode {VELOCITY_CONTROL}", f"w axis{axis}.error 0"]
+            lines += [f"u {axis}", f"w axis{axis}.requested_state {CLOSED_LOOP}"]
         requests = ["f 0", "f 1", "r axis0.error", "r axis1.error", "r vbus_voltage"]
         first, second, first_error, second_error, battery = yield from self._query(lines, requests)
         flags = int(first_error[0]) | int(second_error[0])
@@ -109,19 +114,6 @@ class ODriveAscii:
         except ValueError:
             return None
         return numbers if all(map(math.isfinite, numbers)) else None
-
-
-def _setup(axis: int, timeout_s: float) -> list[str]:
-    """Return the lines that set the watchdog's timeout and feed it before it is enabled."""
-    config = f"w axis{axis}.config"
-    return [f"{config}.enable_watchdog 0", f"{config}.watchdog_timeout {timeout_s:g}", f"u {axis}",
-            f"{config}.enable_watchdog 1"]  # fmt: skip
-
-
-def _arming(axis: int) -> list[str]:
-    """Return the lines that clear the axis' errors and start closed-loop velocity control."""
-    return [f"w axis{axis}.controller.config.control_mode {VELOCITY_CONTROL}", f"w axis{axis}.error 0", f"u {axis}",
-            f"w axis{axis}.requested_state {CLOSED_LOOP}"]  # fmt: skip
 
 
 def _xor(data: bytes) -> int:

@@ -307,7 +307,8 @@ class MapLocaliser:
                 self.places.drop(id)
         scan, free_m = (ranges.astype(np.float16) for ranges in frame.ranges())
         of_odometry = frame.stamp_ns, frame.T_odom_rect, frame.covariance
-        keyframe = PlaceKeyframe(self.places.next_id, self._session, *of_odometry, small, scan, free_m, features)
+        next_id = max(self.places.keyframes, default=-1) + 1
+        keyframe = PlaceKeyframe(next_id, self._session, *of_odometry, small, scan, free_m, features)
         link = None if self._newest is None else Link.by_odometry(self._newest, keyframe)
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
         self._path_at[keyframe.id] = self._path_m

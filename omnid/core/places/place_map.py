@@ -129,11 +129,6 @@ class PlaceMap:
         return len(self.keyframes)
 
     @property
-    def next_id(self) -> int:
-        """Id of the next keyframe."""
-        return max(self.keyframes, default=-1) + 1
-
-    @property
     def loops(self) -> int:
         """Number of links from places that were recognised."""
         return sum(link.is_loop for link in self.links)

@@ -121,7 +121,10 @@ class PlaceSearch:
             effort, ids = FAR, where
         # 1. The most similar thumbnails.
         if ids:
-            others = np.array([self._signature(places, id) for id in ids])
+            for id in ids:
+                if id not in self._signatures:
+                    self._signatures[id] = signature_of(places.keyframes[id].thumbnail)
+            others = np.array([self._signatures[id] for id in ids])
             ranked = np.argsort(-similarities(signature_of(small), others), kind="stable")
             ids = [ids[n] for n in ranked[: effort.voted].tolist()]
         # 2. Votes and geometry of these: the best one, unless another place is as similar.
@@ -133,11 +136,6 @@ class PlaceSearch:
         is_confirmed = where.confirms(best, places.poses)
         self.contradicted = 0 if is_confirmed else self.contradicted + 1
         return best if is_confirmed else None
-
-    def _signature(self, places: PlaceMap, id: int) -> Signature:
-        if id not in self._signatures:
-            self._signatures[id] = signature_of(places.keyframes[id].thumbnail)
-        return self._signatures[id]
 
     def forget_dropped(self, places: PlaceMap) -> None:
         """Forget the keyframes that the map does not hold any more."""

@@ -191,7 +191,7 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
         # 1. The rotation and shift of the upper camera that explain the columns; the rotation, or a part of the shift,
         #    less SIGMAS standard deviations counts.
         drift = estimate_rig_drift(cylinder.rays(lower), cylinder.rays(upper))
-        angles = (drift.turn, drift.turn_sigma), (drift.shift, drift.shift_sigma)
+        angles = (drift.turn, drift.sigmas[:3]), (drift.shift, drift.sigmas[3:])
         turn, shift = (float(np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma)) for angle, sigma in angles)
         misfit_deg = math.degrees(max(turn, SHIFT_WEIGHT * shift, 0.0))
         # 2. Residuals in each direction, which no rotation of a camera explains, show changed intrinsics.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.fit.rig_drift import CORRELATED_POINTS, apply_drift, estimate_rig_drift
+from calib.fit.rig_drift import CORRELATED_POINTS, estimate_rig_drift
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.camera import Array
 from calib.models.unified import UnifiedCamera
@@ -59,7 +59,7 @@ def test_a_rotation_about_every_axis_is_estimated_and_corrected(
     assert drift is not None
     assert np.rad2deg(drift.turn) == pytest.approx(turn_deg, abs=1e-5)
     assert np.abs(drift.shift).max() < 1e-6 and np.abs(drift.residuals).max() < 1e-7
-    again = apply_drift(wrong, drift)
+    again = wrong.with_upper_moved(drift.turn, drift.shift)
     np.testing.assert_allclose(again.upper.T_cam_rig, rig.upper.T_cam_rig, atol=1e-6)
     assert again.lower is wrong.lower and again.topics == rig.topics
 
@@ -71,7 +71,7 @@ def test_distinguishes_a_shifted_viewpoint_from_a_tilt(rig: Rig, around: Array) 
     wrong = replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T_rig_upper)))
     drift = estimate_rig_drift(*rays(rig, around, wrong))
     assert drift is not None
-    again = apply_drift(wrong, drift)
+    again = wrong.with_upper_moved(drift.turn, drift.shift)
     T_true, T_found = (r.lower.T_cam_rig @ se3.inverse(r.upper.T_cam_rig) for r in (rig, again))
     assert np.rad2deg(np.linalg.norm(se3.rotation_log(T_true[:3, :3].T @ T_found[:3, :3]))) < 0.01
     along = [T[:3, 3] / np.linalg.norm(T[:3, 3]) for T in (T_true, T_found)]
@@ -87,9 +87,9 @@ def test_the_fit_is_robust_to_false_matches_and_sigmas_are_consistent(rig: Rig, 
         upper[:60] += 0.1 * rng.standard_normal((60, 3))
         drift = estimate_rig_drift(lower, upper)
         assert drift is not None
-        misses.append((np.rad2deg(drift.turn) - (0.3, -0.2, 0.4)) / np.rad2deg(drift.turn_sigma))
+        misses.append((np.rad2deg(drift.turn) - (0.3, -0.2, 0.4)) / np.rad2deg(drift.sigmas[:3]))
         axis = drift.turn / np.linalg.norm(drift.turn)
-        assert min(drift.turn_sigma) < drift.angle_sigma < np.linalg.norm(drift.turn_sigma)
+        assert min(drift.sigmas[:3]) < drift.angle_sigma < np.linalg.norm(drift.sigmas[:3])
         assert drift.angle_sigma**2 == pytest.approx(axis @ drift.covariance[:3, :3] @ axis)
     spread = np.sqrt(CORRELATED_POINTS * np.mean(np.square(misses)))
     assert 0.6 < spread < 1.2, "the noise here is independent"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib import se3
-from omnid.core.frames import in_outer_axes, of_base
+from omnid.core.frames import in_outer_axes
 from omnid.messages import OdometryUpdate, StereoDepth
 
 MS = 1_000_000
@@ -30,7 +30,7 @@ def test_covariance_of_the_base_equals_the_scatter_of_its_motions() -> None:
     rng = np.random.default_rng(0)
     T_odom_rig, T_base_rig = se3.exp(rng.normal(0, 1, 6)), se3.exp(rng.normal(0, 1, 6))
     root = rng.normal(0, 1e-4, (6, 6))
-    T_odom_base, of_body, velocity, _ = of_base(odometry(T_odom_rig, covariance=root @ root.T), T_base_rig)
+    T_odom_base, of_body, velocity, _ = odometry(T_odom_rig, covariance=root @ root.T).of_base(T_base_rig)
     covariance = in_outer_axes(T_odom_base, of_body)
     small = se3.exp(rng.normal(0, 1, (100_000, 6)) @ root.T)
     moved = T_base_rig @ (T_odom_rig @ small) @ se3.inverse(T_base_rig)
@@ -45,4 +45,4 @@ def test_covariance_of_the_base_equals_the_scatter_of_its_motions() -> None:
 
 def test_base_starts_at_the_origin() -> None:
     T_base_rig = se3.exp([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
-    np.testing.assert_allclose(of_base(odometry(np.eye(4)), T_base_rig)[0], np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(odometry(np.eye(4)).of_base(T_base_rig)[0], np.eye(4), atol=1e-12)

@@ -116,7 +116,8 @@ def test_sigmas_are_consistent_with_errors() -> None:
     assert np.std(ratios) < 1.6 and np.abs(ratios).max() < 4
     length = float(np.linalg.norm(T_TRUE[:3, 3]))
     baseline = np.array([(rig.baseline_m - length) / rig.baseline_sigma_m for rig in rigs])
-    turn = np.array([se3.log(rig.T_upper_lower @ se3.inverse(T_TRUE))[3:] / rig.motion_sigma[3:] for rig in rigs])
+    turn_sigmas = np.array([np.sqrt(np.diag(rig.motion_covariance)[3:]) for rig in rigs])
+    turn = np.array([se3.log(rig.T_upper_lower @ se3.inverse(T_TRUE))[3:] for rig in rigs]) / turn_sigmas
     assert np.sqrt(np.mean(baseline**2)) < 1.6 and 0.4 < np.sqrt(np.mean(turn**2)) < 1.4
 
 
