@@ -110,6 +110,7 @@ def simulate(args: argparse.Namespace) -> int:
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
     paced = PacedRobot(world, robot, config, args.seed)
+    log(logging.INFO, f"{world.name} is simulated until Ctrl-C: `omnid arm`, `omnid drive` ... in another terminal")
     run_live(config, paced, paced.rig)
     # 2. Write the truth, and report contacts.
     if args.truth:  # the poses of the base since the first one, with the stamps of the poses on the bus

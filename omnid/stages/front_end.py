@@ -108,7 +108,7 @@ class FrontEnd:
             pair.lower,
             pair.upper,
             lambda exposure: self.dense.points(pair, exposure).disparity,
-            np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable,
+            np.zeros_like(pair.visible) if pair.light.is_noise else pair.usable,
             pair.times,
             interval_s,
             lost=pair.tiles.lost_pixels(pair.visible.shape),

@@ -208,7 +208,7 @@ class Places:
     def _frame(self, odometry: OdometryUpdate) -> OdometryFrame:
         """Return the frame in terms of the rectified frame."""
         depth, pair = odometry.depth, odometry.depth.panoramas
-        usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
+        usable = np.zeros_like(pair.visible) if pair.light.is_noise else pair.usable
         stereo = StereoFrame(
             odometry.seq, pair.lower, pair.upper, lambda _: self._dense.of(depth).disparity, usable, pair.times
         )

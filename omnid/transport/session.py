@@ -82,8 +82,8 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
     except zenoh.ZError as error:
         if config.is_client:
             raise Unreachable(
-                f"bus cannot reach {', '.join(config.connect)}: start the robot or router there, or change bus.connect "
-                f"({reason(error)})"
+                f"cannot reach a robot at {', '.join(config.connect)}: start it, or a router, there, or name another "
+                f"endpoint by --connect or bus.connect ({reason(error)})"
             ) from error
         raise OmnidError(
             f"bus cannot listen on {', '.join(config.listen)}: stop the other program there or change bus.listen; of a "

@@ -160,7 +160,7 @@ def test_without_a_robot_the_error_says_what_to_do(course: Path) -> None:
         ]:
             out, err = process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 2 and out == ""
-            assert err.startswith("omnid: bus cannot reach ") and err.count("\n") == 1
+            assert err.startswith("omnid: cannot reach a robot at ") and err.count("\n") == 1
 
 
 @pytest.mark.hazard("H41")

@@ -29,6 +29,7 @@ from omnid.core.odometry.corners import corners
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.pose_estimation import OUTLIER_SQUARED
 from omnid.core.odometry.tracking import KltSettings, track
+from omnid.core.stereo.photometry import block_means
 from omnid.core.stereo.semiglobal import MIN_DISPARITY_PX
 from omnid.core.stereo.tiles import TEXTURE_GREY
 from omnid.core.types.panorama import PaddedPanorama, Panoramas
@@ -36,7 +37,6 @@ from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Image = NDArray[np.uint8]
 
 # Corners per pair: two pairs have MIN_MATCHES if four corners in ten are found.
 POINTS: Final = 160
@@ -145,7 +145,7 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
     """
     # 1. Corners of the lower panorama, and the best place of each in the upper one, both reduced.
     points = corners(lower, visible, POINTS)
-    small_lower, small_upper = (_reduced(padded.image) for padded in (lower, upper))
+    small_lower, small_upper = (block_means(padded.image, COARSE) for padded in (lower, upper))
     aside, down_most = at_scale(ASIDE_PX, lower.scale), at_scale(DOWN_PX, lower.scale)
     guess, good, clear = points.copy(), np.zeros(len(points), bool), 0
     reduced = ((points + np.array([lower.pad_px, 0])) / COARSE).round().astype(int)
@@ -172,12 +172,6 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
         columns = above[:, 0] + of_motion.upper[:, 0]
         below, above = views[known, :2], np.column_stack([columns, views[:, 2]])[known]
     return Matches(below, above, len(points), clear)
-
-
-def _reduced(image: Image) -> Image:
-    width, height = image.shape[1] // COARSE, image.shape[0] // COARSE
-    whole = image[: height * COARSE, : width * COARSE]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> RigFinding:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,7 +53,7 @@ class Light:
         return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < MIN_CONTRAST_TO_NOISE
 
     @property
-    def shows_nothing(self) -> bool:
+    def is_noise(self) -> bool:
         """True if the corners of a dim image are noise, so that a map of them would be wrong."""
         return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < MIN_CONTRAST_TO_NOISE / 2
 
@@ -101,14 +102,14 @@ def noise_sigma(panorama: Image, visible: Flags) -> float:
         band = panorama[top : top + BAND_ROWS].astype(np.float32)
         difference = cv2.GaussianBlur(band, (0, 0), FINE_PX) - cv2.GaussianBlur(band, (0, 0), COARSE_PX)
         shown = visible[top : top + BAND_ROWS].astype(np.float32)
-        magnitude, share = _blocks(np.abs(difference)), _blocks(shown)
+        magnitude, share = (block_means(image, BLOCK_PX) for image in (np.abs(difference), shown))
         means.append(magnitude[share == 1])
     found = np.concatenate(means)
     return NOISE_SCALE * float(np.percentile(found, SMOOTHEST_PERCENT)) if len(found) else MEASURED_NOISE_GREY
 
 
-def _blocks(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the means of whole blocks of BLOCK_PX."""
-    rows, columns = image.shape[0] // BLOCK_PX, image.shape[1] // BLOCK_PX
-    whole = image[: rows * BLOCK_PX, : columns * BLOCK_PX]
-    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.float32)
+def block_means(image: NDArray[Any], side_px: int) -> NDArray[Any]:
+    """Return the means (H / side, W / side) of the whole square blocks of an image (H, W), in its type."""
+    rows, columns = image.shape[0] // side_px, image.shape[1] // side_px
+    whole = image[: rows * side_px, : columns * side_px]
+    return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA))
