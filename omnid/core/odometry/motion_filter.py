@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.odometry.exposure_times import RigVelocity
+from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS
 from omnid.core.odometry.motion_sensors import (
     ACCELERATION_SIGMAS,
     AHEAD,
@@ -192,14 +193,20 @@ class MotionFilter:
         velocity at the pair before the step, from the steps around it. A velocity that changes evenly is exact there;
         how far it changes unevenly in a step, no step shows.
         """
-        # 1. The cameras, and then the sensors, each if it agrees.
+        # 1. The cameras, and then the sensors, each if it agrees. A step that no acceleration explains, as by a jerk,
+        #    does not tell how the motion goes on: as before, or as in the step.
         if interval_s is not None:
             self._filter.x, self._filter.P = self._before_sensing
-        self.update(T_prev_curr, covariance, dt_s)
+        now, before, self._last_step = self.of_step(T_prev_curr, dt_s), self._last_step, (T_prev_curr, dt_s)
+        change = now.twist - self.velocity
+        squared = change @ np.linalg.solve(self.velocity_covariance + 4 * now.covariance, change)
+        if squared < len(change) * REACH_SIGMAS**2:
+            self.update(T_prev_curr, covariance, dt_s)
+        else:
+            self._filter.P[VELOCITY, VELOCITY] += np.outer(change, change)
         if interval_s is not None:
             self._compare(interval_s, dt_s)
         # 2. The velocity at the pair before.
-        now, before, self._last_step = self.of_step(T_prev_curr, dt_s), self._last_step, (T_prev_curr, dt_s)
         if before is None:
             return now
         before_rate, before_s = se3.log(before[0]) / before[1], before[1]

@@ -173,6 +173,26 @@ def turning(sample: MotionSample, slip_radps: float) -> MotionSample:
     return sample
 
 
+def test_a_jerk_leaves_open_whether_the_motion_goes_on_as_before() -> None:
+    """A turn by 90 degrees within one step: the next one may be as before, or as this one, which two steps confirm."""
+    motion, ahead = MotionFilter(), np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])
+    jerk = ahead + np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2])
+
+    def predicted(*steps: Array) -> tuple[Array, float]:
+        for moved in steps:
+            motion.step(None, PAIR_S, 0.5)
+            motion.accept(se3.exp(moved), CAMERA_COVARIANCE, PAIR_S, None)
+        T, _ = motion.step(None, PAIR_S, 0.5)
+        return se3.log(T), PAIR_S * float(np.sqrt(motion.velocity_covariance[5, 5]))
+
+    expected, sigma_rad = predicted(*[ahead] * 10)
+    assert np.allclose(expected, ahead, atol=2e-3) and sigma_rad < 0.05
+    expected, sigma_rad = predicted(jerk)
+    assert np.abs(expected - ahead).max() < 2e-3 and sigma_rad > np.pi / 2
+    expected, sigma_rad = predicted(jerk, jerk)
+    assert np.abs(expected - jerk).max() < 0.1 and sigma_rad < 0.1
+
+
 @pytest.mark.parametrize("of_gyro", [True, False])
 @pytest.mark.parametrize("period_s", [0.1, 1 / 30])
 def test_a_steady_turn_of_one_sensor_alone_is_noticed_before_clocks_are_learned(period_s: float, of_gyro: bool) -> None:
