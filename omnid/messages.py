@@ -101,8 +101,8 @@ class OdometryUpdate:
     def of_base(self, T_base_rig: Array) -> BaseMotion:
         """Return the motion of the base that carries the rig."""
         A = se3.adjoint(T_base_rig)
-        pose = base_pose(self.T_odom_rig, self.covariance, T_base_rig)
-        return BaseMotion(*pose, A @ self.velocity, A @ self.velocity_covariance @ A.T)
+        T_odom_base, covariance = base_pose(self.T_odom_rig, self.covariance, T_base_rig)
+        return BaseMotion(T_odom_base, covariance, A @ self.velocity, A @ self.velocity_covariance @ A.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

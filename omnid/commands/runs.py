@@ -172,7 +172,8 @@ def replay(args: argparse.Namespace) -> int:
     with closing(sink_of(args.rerun, args.log)) as sink:
         from omnid.viewer.rerun_sink import ReplayDrawing
 
-        drawn = replace(asked, map_every_s=config.live.cloud_s, observer=partial(ReplayDrawing, sink))
+        drawing = partial(ReplayDrawing, sink, config.obstacles.scan.max_range_m)
+        drawn = replace(asked, map_every_s=config.live.cloud_s, observer=drawing)
         return replay_and_print(args.log, config, drawn, args)
 
 

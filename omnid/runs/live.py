@@ -124,7 +124,7 @@ def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> None:
         priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
         graph = Graph(drops=True, depth=1, on_thread=partial(start_thread, priorities, log))
     with ExitStack() as outputs:
-        session = Session(config, graph, outputs, warn, robot.clock)
+        session = Session(config, graph, outputs, warn, RunStatistics(robot.clock))
         # 1. The rig, and what is compiled or imported before the first image.
         geometry = session.geometry(rig or read_rig(Path(config.cameras.rig)), ())
         published = (topic.schema for topic in topics.PUBLISHED.values())
@@ -153,7 +153,7 @@ def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> None:
 
 def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlaces:
     """Connect robot, bus and files, and wire the stages between them; return the map of places."""
-    config, graph, clock, statistics = session.config, session.graph, session.clock, session.statistics
+    config, graph, clock, statistics = session.config, session.graph, robot.clock, session.statistics
     rig, health, motion = front_end.geometry.rig, front_end.health, front_end.pairing.motion
 
     # 1. Cameras and wheels, the bus, the map of places.
@@ -193,11 +193,14 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
         poses,
         thread=BACKGROUND,
     )
-    streams.publish(graph, BusSink(bus, session.encoder(rig), gives_time=robot.waits))
+    scan_range_m = config.obstacles.scan.max_range_m
+    on_bus = Encoder(rig, scan_range_m, clock.unix_ns, names.RUN_ID)
+    streams.publish(graph, BusSink(bus, on_bus, gives_time=robot.waits))
     if config.bus.panorama_hz:
         graph.sink("panorama", PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns), poses, thread=BACKGROUND)
     if config.record.enabled:
-        recorder = open_recorder(config, rig_toml(rig), clock, session.encoder(rig))
+        in_files = Encoder(rig, scan_range_m, clock.segment_unix_ns)
+        recorder = open_recorder(config, rig_toml(rig), clock, in_files)
         session.outputs.callback(recorder.close)
         session.parts[names.RECORDING] = recorder.stats
         images: Sequence[Stream[Any]] = [pairs] if config.record.images_hz else frames
@@ -248,14 +251,14 @@ def open_recorder(config: Config, rig: str, clock: RobotClock, encode: Encoder |
     """Return a recorder to the folder of the configuration; the first message makes the first file.
 
     rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
-    clock: see Recorder. encode: of the other messages of a run, whose images are thinned to record.images_hz; None: all
-    images and nothing else are recorded.
+    clock, encode: see Recorder; encode of the other messages of a run, whose images are thinned to record.images_hz;
+    None: all images and nothing else are recorded.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = Path(config.record.folder)
     files = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=log)
     images_hz = config.record.images_hz if encode is not None else 0.0
-    return Recorder(files, config.bus.robot, encode, clock=clock, images_hz=images_hz)
+    return Recorder(files, config.bus.robot, clock, encode, images_hz=images_hz)
 
 
 def record_frames(sources: Mapping[Camera, FrameSource], config: Config, rig: str) -> Recorder:

@@ -27,6 +27,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.status import RunCounters, RunStatistics, input_warnings, pair_loss
 from omnid.engine.graph import POLL_S, Graph, Sink, sleep_until
+from omnid.engine.robot_clock import log_time
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
@@ -36,14 +37,14 @@ from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import BACKGROUND, Inputs, Session, attached_rig, run_to_end, wire
 from omnid.settings import dump
-from omnid.sinks.encoder import BusSink, Outgoing
+from omnid.sinks.encoder import BusSink, Encoder, Outgoing
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.mapping import Places
 from omnid.stages.obstacles import FLOOR_WARNING
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport.status_names import MOTION, entry
+from omnid.transport.status_names import MOTION, RUN_ID, entry
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 
@@ -160,7 +161,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
     with ExitStack() as closing:
         # 2. The log and its rig; compiling may take a minute, so that a log or a rig that is wrong is refused first.
         warnings = list[str]()
-        session = Session(config, graph, closing, warnings.append)
+        session = Session(config, graph, closing, warnings.append, RunStatistics())
         given_rig = read_rig(options.rig) if isinstance(options.rig, Path) else options.rig
         cameras = LogCameras(*options.topics, config.cameras.bits, config.log.time)
         topics = given_rig.topics if given_rig else ("", "")
@@ -184,6 +185,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         collected, kept = list[tuple[Any, ...]](), attrgetter("stamp_ns", "T_odom_rig", "covariance", "state")
         updates, newest_map = list[PlaceUpdate](), deque[MapUpdate](maxlen=1)
         rig = geometry.rig
+        encoder = partial(Encoder, rig, config.obstacles.scan.max_range_m)
         recorder: Recorder | None = None
         graph.sink("statistics", session.statistics, poses, thread=poses.thread)
         if options.collect:
@@ -202,10 +204,10 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             )
         if options.publish:
             bus = session.open_bus(rig, gives_time=True)
-            streams.publish(graph, BusSink(bus, session.encoder(rig), gives_time=True))
+            streams.publish(graph, BusSink(bus, encoder(run_id=RUN_ID), gives_time=True))
         if options.record:
             attachments = {"rig.toml": rig_toml(rig).encode(), "omnid.toml": dump(config).encode()}
-            recorder = Recorder(SingleLog(options.record, attachments), config.bus.robot, session.encoder(rig))
+            recorder = Recorder(SingleLog(options.record, attachments), config.bus.robot, log_time(), encoder())
             closing.callback(recorder.close)
         if observer := options.observer(front_end) if options.observer else recorder:
             graph.sink("record", observer, *(one.stream for one in streams.leaving))

@@ -23,7 +23,6 @@ from omnid.core.control.control_law import ControllerState
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.diagnostics.status import RunStatistics
 from omnid.engine.graph import Graph, Output, Poller, Stream, run_in_thread
-from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import (
@@ -37,7 +36,6 @@ from omnid.messages import (
 from omnid.runs.files import RouteFiles, RunPlaces
 from omnid.settings import dump
 from omnid.sinks.drive import LiveDrive, arming_answers, navigation_answers, send_scan, send_setpoint
-from omnid.sinks.encoder import Encoder
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.mapping import MapGrid, Mapping, Places
@@ -49,7 +47,6 @@ from omnid.transport.codec import Diagnostics
 from omnid.transport.topics import MAX_OPEN, Answers
 
 BUS_S: Final = 3.0  # Time until a bus must be closed.
-CLOUD_POINTS: Final = 50_000  # Most points of the map in one message.
 
 BUS, FILES, BACKGROUND = "bus", "files", "background"  # threads that several stages and sinks share
 
@@ -89,11 +86,10 @@ class Session:
         graph: Graph,
         outputs: ExitStack,
         warn: Callable[[str], None],
-        clock: RobotClock | None = None,
+        statistics: RunStatistics,
     ) -> None:
-        """warn: takes a line for the user; clock: that of the stamps of the frames, None: they are Unix time."""
-        self.config, self.graph, self.outputs, self.warn = config, graph, outputs, warn
-        self.clock, self.statistics = clock or log_time(), RunStatistics(clock)
+        """warn: takes a line for the user."""
+        self.config, self.graph, self.outputs, self.warn, self.statistics = config, graph, outputs, warn, statistics
         # Numbers of the parts of a live run, by their names.
         self.parts: dict[str, Callable[[], status_names.Stats]] = {}
 
@@ -127,11 +123,6 @@ class Session:
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         return bus
-
-    def encoder(self, rig: Rig) -> Encoder:
-        """Return an encoder of the messages that leave the run."""
-        scan_range_m = self.config.obstacles.scan.max_range_m
-        return Encoder(rig.T_base_rig, CLOUD_POINTS, self.clock.unix_ns, rig, scan_range_m)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Poses, commands and maps as ROS 2 messages (topic, schema, CDR bytes) for the bus and for logs, and their sinks."""
+"""Poses, commands and maps as ROS 2 messages (topic, CDR bytes) for the bus and for logs, and their sinks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calib import se3
 from calib.rig import Rig
@@ -23,10 +22,10 @@ from omnid.navigation_state import NavigationState, with_reason
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
 from omnid.transport.bus import Bus
-from omnid.transport.codec import CLOCK_SCHEMA, Diagnostics, DiagnosticStatus, PoseAttachment, encoded, path_cdr
+from omnid.transport.codec import CLOCK_SCHEMA, Diagnostics, DiagnosticStatus, PoseAttachment, encoded
 from omnid.transport.sensor_codec import gyro_cdr, image_cdr, wheel_cdr
-from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, RUN_ID, Key, Stats, entry
-from omnid.transport.topics import CLOCK, MAP_POSE, PANORAMA, PUBLISHED, SCAN
+from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry
+from omnid.transport.topics import CLOCK, MAP_POSE, PANORAMA, SCAN
 
 Outgoing: TypeAlias = (
     OdometryUpdate
@@ -41,41 +40,31 @@ Outgoing: TypeAlias = (
 
 
 UnixTime: TypeAlias = Callable[[int], int]  # returns the Unix time of a stamp [ns]
-# Topic, ROS type and bytes of an encoded message; a topic without a leading '/' is below the robot's name.
-OutgoingMessage: TypeAlias = tuple[str, str, bytes]
+# Topic (of PUBLISHED) and bytes of an encoded message.
+OutgoingMessage: TypeAlias = tuple[str, bytes]
 
+CLOUD_POINTS: Final = 50_000  # of a cloud at most; a larger one is thinned evenly
 # Of the path that is published: most vertices, the least distance between two of them, and the time between two paths.
 PATH_POSES, PATH_STEP_M, PATH_NS = 500, 0.05, 5 * NS_PER_S
-
-
-def _on(topic: str, payload: bytes) -> OutgoingMessage:
-    """Return a message on one of the topics that are published."""
-    return topic, PUBLISHED[topic].schema, payload
 
 
 class Encoder:
     """Encodes messages for ROS 2; their frame odom is the base's at the first pair, not the rig's.
 
     The static frames come before the first pose, and a status before a pose whose state in odom or in the map is
-    another one, with the stamp of the pose.
+    another one, with the stamp of the pose. On the bus the path of the base follows each PATH_NS, for programs that
+    connect later.
     """
 
-    def __init__(
-        self,
-        T_base_rig: NDArray[np.float64],
-        cloud_points: int,
-        unix_ns: UnixTime = int,
-        rig: Rig | None = None,
-        scan_range_m: float = 6.0,
-    ) -> None:
-        """cloud_points: the largest number of points of the cloud; a larger one is thinned evenly.
+    def __init__(self, rig: Rig, scan_range_m: float, unix_ns: UnixTime = int, run_id: str = "") -> None:
+        """scan_range_m: obstacles.scan.max_range_m.
 
-        unix_ns: returns the Unix time of a stamp of the messages; that of a log is Unix time already. rig: with the
-        mounting of the cameras, for the static frames; None: they are left out.
+        unix_ns: returns the Unix time of a stamp of the messages; that of a log is Unix time already. run_id: identity
+        of the run on the bus, for other programs' recordings; empty in an own log, which holds one run.
         """
-        self.T_base_rig, self.unix_ns, self._rig = T_base_rig, unix_ns, rig
-        self._cloud_points, self._scan_range_m = cloud_points, scan_range_m
-        self.run_id = ""  # identity of the run, for other programs' recordings; an own log holds one run
+        self._rig, self._T_base_rig, self._scan_range_m = rig, rig.T_base_rig, scan_range_m
+        self.unix_ns, self.run_id = unix_ns, run_id
+        self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
         self.repeat_states()
 
     def repeat_states(self) -> None:
@@ -90,38 +79,34 @@ class Encoder:
             case OdometryUpdate():
                 yield from self._poses(message, stamp_ns)
             case VelocityCommand(_, velocity_mps, _, yaw_rate_radps):
-                payload = codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
-                yield _on("drive", payload)
+                yield "drive", codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
             case PlaceUpdate():
                 yield from self._map_pose(message, stamp_ns)
             case ObstacleScan():
                 limits_m = 0.0, self._scan_range_m
-                yield _on(SCAN, codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m))
-                yield _on("moving", codec.moving_cdr(stamp_ns, "odom", message.moving))
+                yield SCAN, codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m)
+                yield "moving", codec.moving_cdr(stamp_ns, "odom", message.moving)
             case MapUpdate():
-                points, step = message.points, len(message.points.xyz) // self._cloud_points + 1
-                xyz, confidence = se3.apply(self.T_base_rig, points.xyz[::step]), points.confidence[::step]
-                yield _on("cloud", codec.point_cloud_cdr(stamp_ns, "odom", xyz, confidence))
+                points, step = message.points, len(message.points.xyz) // CLOUD_POINTS + 1
+                xyz, confidence = se3.apply(self._T_base_rig, points.xyz[::step]), points.confidence[::step]
+                yield "cloud", codec.point_cloud_cdr(stamp_ns, "odom", xyz, confidence)
             case GridUpdate():
                 grid = message.grid
-                yield _on("map", codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner))
+                yield "map", codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
             case Diagnostics():
-                yield _on("status", codec.diagnostics_cdr(stamp_ns, message.statuses))
+                yield "status", codec.diagnostics_cdr(stamp_ns, message.statuses)
             case NavigationUpdate():
                 status = entry(NAVIGATION, navigation_stats(message))
-                yield _on("navigation", codec.diagnostics_cdr(stamp_ns, [status]))
+                yield "navigation", codec.diagnostics_cdr(stamp_ns, [status])
                 if message.plan is not None:
                     plan = message.plan
-                    yield _on("plan", codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad))
+                    yield "plan", codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad)
 
     def _poses(self, odometry: OdometryUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
         # 1. The static frames: base_link -> rig -> lower and upper camera; the state.
         if self._state is None:
-            edges = [("base_link", "rig", self.T_base_rig)]
-            if self._rig is not None:
-                cameras = {"lower": self._rig.lower, "upper": self._rig.upper}
-                edges += [("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
-            yield _on("/tf_static", codec.transform_cdr(stamp_ns, edges))
+            cameras = [("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in self._rig.sides]
+            yield "/tf_static", codec.transform_cdr(stamp_ns, [("base_link", "rig", self._T_base_rig), *cameras])
         if (odometry.state, odometry.reset_counter) != self._state:
             self._state = odometry.state, odometry.reset_counter
             values = {
@@ -133,33 +118,39 @@ class Encoder:
             }
             level = list(TrackingState).index(odometry.state)
             status = DiagnosticStatus.of(ODOMETRY, level, odometry.state, values)
-            yield _on("status", codec.diagnostics_cdr(stamp_ns, [status]))
+            yield "status", codec.diagnostics_cdr(stamp_ns, [status])
         # 2. The pose and its transform.
-        T_odom_base, covariance, velocity, velocity_covariance = odometry.of_base(self.T_base_rig)
+        T_odom_base, covariance, velocity, velocity_covariance = odometry.of_base(self._T_base_rig)
         covariance = in_outer_axes(T_odom_base, covariance)
-        yield _on("odom", codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity, velocity_covariance))
-        yield _on("pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base))
-        yield _on("/tf", codec.transform_cdr(stamp_ns, [("odom", "base_link", T_odom_base)]))
+        yield "odom", codec.odometry_cdr(stamp_ns, T_odom_base, covariance, velocity, velocity_covariance)
+        yield "pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base)
+        yield "/tf", codec.transform_cdr(stamp_ns, [("odom", "base_link", T_odom_base)])
         # 3. Samples of wheels and gyro up to the pair; those after it come with the next one again.
         for sample in odometry.motion:
             if sample.stamp_ns > odometry.stamp_ns:
                 continue
             if isinstance(sample, WheelSample):
-                yield _on("wheel_odom", wheel_cdr(sample, self.unix_ns(sample.stamp_ns)))
+                yield "wheel_odom", wheel_cdr(sample, self.unix_ns(sample.stamp_ns))
             else:
-                yield _on("imu", gyro_cdr(sample, self.unix_ns(sample.stamp_ns)))
+                yield "imu", gyro_cdr(sample, self.unix_ns(sample.stamp_ns))
+        # 4. On the bus, the path of the base.
+        if self.run_id:
+            self._path.add(*T_odom_base[:2, 3].tolist())
+            if odometry.stamp_ns >= self._path_ns + PATH_NS:
+                self._path_ns = odometry.stamp_ns
+                yield "path", codec.path_cdr(stamp_ns, "odom", self._path.xy())
 
     def _map_pose(self, update: PlaceUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
         if update.state != self._state_in_map:
             self._state_in_map = update.state
             status = entry(PLACES, {Key.STATE: update.state})
-            yield _on("status", codec.diagnostics_cdr(stamp_ns, [status]))
-        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
+            yield "status", codec.diagnostics_cdr(stamp_ns, [status])
+        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
         pose = (T_map_base, np.ravel(in_outer_axes(T_map_base, covariance)))
-        yield _on(MAP_POSE, codec.encoded(codec.MAP_POSE_SCHEMA, (stamp_ns, "map"), pose))
+        yield MAP_POSE, codec.encoded(codec.MAP_POSE_SCHEMA, (stamp_ns, "map"), pose)
         if update.is_known:  # A transform has no covariance to state that it is unknown.
-            T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
-            yield _on("/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)]))
+            T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self._T_base_rig)
+            yield "/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)])
 
 
 def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0, run: str = "") -> bytes:
@@ -195,9 +186,7 @@ class BusSink:
 
     def __init__(self, bus: Bus, encode: Encoder, *, gives_time: bool = False) -> None:
         """gives_time: /clock advances by the stamps of poses and commands, which come from one thread."""
-        self._gives_time, self._time_ns = gives_time, 0
-        self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
-        self._bus, self._encode, encode.run_id = bus, encode, RUN_ID
+        self._bus, self._encode, self._gives_time, self._time_ns = bus, encode, gives_time, 0
 
     def process(self, message: Outgoing) -> None:
         """Publish a message; a pose with its attachment."""
@@ -207,18 +196,10 @@ class BusSink:
             self._time_ns = message.stamp_ns
             self._bus.publish(CLOCK, encoded(CLOCK_SCHEMA, self._encode.unix_ns(message.stamp_ns)))
         # 2. The message itself.
-        attachment = pose_attachment(message, time.time_ns(), RUN_ID) if isinstance(message, OdometryUpdate) else None
-        for topic, _, payload in self._encode(message):
+        run = self._encode.run_id
+        attachment = pose_attachment(message, time.time_ns(), run) if isinstance(message, OdometryUpdate) else None
+        for topic, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
-        # 3. The path of the base each PATH_NS, for subscribers that connect later.
-        if isinstance(message, OdometryUpdate):
-            T_base_rig = self._encode.T_base_rig
-            T_odom_base = T_base_rig @ message.T_odom_rig @ se3.inverse(T_base_rig)
-            self._path.add(*T_odom_base[:2, -1].tolist())
-            if message.stamp_ns >= self._path_ns + PATH_NS:
-                self._path_ns = message.stamp_ns
-                path = path_cdr(self._encode.unix_ns(message.stamp_ns), "odom", self._path.xy())
-                self._bus.publish("path", path)
 
 
 class PanoramaSink:

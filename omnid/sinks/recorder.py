@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TypeAlias
@@ -10,11 +10,11 @@ from typing import TypeAlias
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotatingLogState
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.engine.robot_clock import RobotClock, log_time
+from omnid.engine.robot_clock import RobotClock
 from omnid.messages import FramePair
-from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage
+from omnid.sinks.encoder import Encoder, Outgoing
 from omnid.transport.sensor_codec import image_cdr, image_topic
-from omnid.transport.topics import ros_name
+from omnid.transport.topics import PUBLISHED, ros_name
 
 Recorded: TypeAlias = Frame | FramePair | Outgoing
 
@@ -60,20 +60,16 @@ class Recorder:
         self,
         log: SingleLog | RotatingLog,
         robot: str,
+        clock: RobotClock,
         encode: Encoder | None = None,
         *,
-        clock: RobotClock | None = None,
         images_hz: float = 0.0,
     ) -> None:
-        """clock: of the stamps, None: they are Unix time. encode: takes the time of each file from now on.
+        """clock: of the stamps. encode: with the time of the files, the clock's segment_unix_ns.
 
         images_hz: pairs per second whose images are recorded; 0: all. Single images are always recorded.
         """
-        self._log, self._robot, self._encode = log, robot, encode
-        self._clock = clock or log_time()
-        self._steps = self._clock.steps
-        if encode is not None:
-            encode.unix_ns = self._clock.segment_unix_ns
+        self._log, self._robot, self._encode, self._clock, self._steps = log, robot, encode, clock, clock.steps
         self._period_ns, self._period_index = round(NS_PER_S / images_hz) if images_hz else 1, -1
         self._file_count = 0
 
@@ -105,15 +101,12 @@ class Recorder:
             previous, self._period_index = self._period_index, message.stamp_ns // self._period_ns
             frames = message.frames if self._period_index != previous else ()
         elif encode is not None and not isinstance(message, Frame):
-            self._write(encode(message), stamp_ns)
+            for topic, payload in encode(message):
+                self._log.write(ros_name(self._robot, topic), PUBLISHED[topic].schema, payload, stamp_ns)
         for frame in frames:
             frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
-            self._write([(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
+            self._log.write(ros_name(self._robot, image_topic(frame)), *image_cdr(frame, frame_ns), frame_ns)
 
     def close(self) -> None:
         """Complete the last file; a second call does nothing."""
         self._log.close()
-
-    def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
-        for topic, schema, payload in messages:
-            self._log.write(ros_name(self._robot, topic), schema, payload, stamp_ns)

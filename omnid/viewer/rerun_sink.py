@@ -232,14 +232,15 @@ class RerunSink:
 class ReplayDrawing:
     """Sink of a replay: draws each message as a robot's subscribers get it, with features and depth."""
 
-    def __init__(self, sink: RerunSink, front_end: FrontEnd) -> None:
+    def __init__(self, sink: RerunSink, scan_range_m: float, front_end: FrontEnd) -> None:
+        """scan_range_m: obstacles.scan.max_range_m."""
         self._sink, self._geometry, self._dense = sink, front_end.geometry, front_end.dense
-        self._encode = Encoder(front_end.geometry.rig.T_base_rig, MAP_POINTS)
+        self._encode = Encoder(front_end.geometry.rig, scan_range_m)
 
     def process(self, message: Outgoing) -> None:
         """Draw a message."""
         attachment = pose_attachment(message) if isinstance(message, OdometryUpdate) else b""
-        for topic, _, payload in self._encode(message):
+        for topic, payload in self._encode(message):
             if topic in REPLAYED:
                 self._sink.draw(PUBLISHED[topic].decode(payload, attachment if topic == "odom" else b""))
         sink, rig = self._sink, self._geometry.rig

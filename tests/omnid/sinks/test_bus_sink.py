@@ -24,10 +24,10 @@ from omnid.core.types.panorama import PaddedPanorama
 from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
 from omnid.sinks.drive import navigation_answers, send_setpoint
-from omnid.sinks.encoder import BusSink, Encoder, Outgoing, PanoramaSink
+from omnid.sinks.encoder import CLOUD_POINTS, BusSink, Encoder, Outgoing, PanoramaSink
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PlanarPath, decode_pose
-from omnid.transport.topics import Answer
+from omnid.transport.topics import PUBLISHED, Answer
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.simulation import make_rig
 from tests.waiting import wait_until
@@ -39,6 +39,7 @@ def unix_ns(stamp_ns: int) -> int:
     return stamp_ns + OFFSET_NS
 
 
+RIG = replace(make_rig(size=256), T_base_rig=np.eye(4))
 IMAGE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), np.uint8), (0, 0), 4)
 
 
@@ -52,7 +53,7 @@ def odometry(seq: int) -> OdometryUpdate:
 def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     endpoint, came = free_endpoint(), {}
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), 10, unix_ns))
+        sink = BusSink(bus, Encoder(RIG, 6.0, unix_ns, "run"))
         robot.on_message(lambda topic, payload, note: came.update({topic: (payload, note)}))
         wait_until(lambda: sink.process(odometry(2)) is None and {"odom", "pose", "tf"} <= came.keys())
     pose = decode_pose(*came["odom"])
@@ -71,7 +72,7 @@ def test_a_run_with_a_time_of_its_own_publishes_it_and_never_back(gives_time: bo
     came: list[tuple[str, bytes]] = []
     bus = Bus(BusConfig(listen=(endpoint,)), gives_time=gives_time)
     with contextlib.closing(bus), Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), 10, unix_ns), gives_time=gives_time)
+        sink = BusSink(bus, Encoder(RIG, 6.0, unix_ns, "run"), gives_time=gives_time)
         robot.on_message(lambda topic, payload, _: came.append((topic, payload)))
         wait_until(lambda: sink.process(odometry(len(came) + 2)) is None and any(topic == "odom" for topic, _ in came))
         newest = len(came) + 100
@@ -118,7 +119,9 @@ def test_panoramas_are_published_at_the_configured_rate() -> None:
 def test_a_late_subscriber_gets_the_path_of_the_drive() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
-        sink = BusSink(bus, Encoder(se3.transform(np.eye(3), [0.2, 0.0, 1.0]), 10))
+        sink = BusSink(
+            bus, Encoder(replace(RIG, T_base_rig=se3.transform(np.eye(3), [0.2, 0.0, 1.0])), 6.0, run_id="run")
+        )
         for k in range(101):
             T = se3.transform(np.eye(3), [0.01 * k, 0.0, 0.0])
             sink.process(replace(odometry(k), T_odom_rig=T))
@@ -131,26 +134,25 @@ def test_a_late_subscriber_gets_the_path_of_the_drive() -> None:
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
-def decoded(message: Outgoing, points: int = 10) -> list[tuple[str, Any]]:
+def decoded(message: Outgoing, encode: Encoder) -> list[tuple[str, Any]]:
     """Return topics and messages of ROS 2."""
-    encode = Encoder(np.eye(4), points, unix_ns)
-    return [(topic, STORE.deserialize_cdr(payload, schema)) for topic, schema, payload in encode(message)]
+    return [(topic, STORE.deserialize_cdr(payload, PUBLISHED[topic].schema)) for topic, payload in encode(message)]
 
 
 def test_a_cloud_has_a_bounded_number_of_points() -> None:
-    xyz = np.arange(12, dtype=np.float32).reshape(4, 3)
-    ages = np.zeros(4, np.int32)
-    points = MapPoints(xyz, np.array([0.9, 0.1, 0.2, 0.8], np.float32), ages, ages)
-    [(topic, cloud)] = decoded(MapUpdate(1, 1, points, np.zeros((0, 2))), points=2)
+    xyz = np.arange(6 * CLOUD_POINTS, dtype=np.float32).reshape(-1, 3)
+    ages = np.zeros(len(xyz), np.int32)
+    points = MapPoints(xyz, np.linspace(0.1, 0.9, len(xyz), dtype=np.float32), ages, ages)
+    [(topic, cloud)] = decoded(MapUpdate(1, 1, points, np.zeros((0, 2))), Encoder(RIG, 6.0, unix_ns))
     shown = np.frombuffer(cloud.data.tobytes(), np.float32).reshape(cloud.width, -1)[:, :3]
-    assert topic == "cloud" and shown.tolist() == xyz[[0, 3]].tolist()
+    assert topic == "cloud" and len(shown) <= CLOUD_POINTS and np.array_equal(shown, xyz[::3])
 
 
 def test_the_static_frames_lead_from_the_base_to_the_cameras() -> None:
     rig = replace(make_rig(size=256), T_base_rig=se3.exp([0.1, 0.0, 0.4, 0.0, 0.1, 0.5]))
-    topic, schema, payload = next(iter(Encoder(rig.T_base_rig, 1, unix_ns, rig)(odometry(0))))
+    topic, message = decoded(odometry(0), Encoder(rig, 6.0, unix_ns))[0]
     found = {}
-    for edge in cast("Any", STORE.deserialize_cdr(payload, schema)).transforms:
+    for edge in message.transforms:
         t, q = edge.transform.translation, edge.transform.rotation
         T = se3.transform(se3.rotation([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
         found[edge.header.frame_id, edge.child_frame_id] = T
