@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.models.camera import OmniCamera
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.errors import DriverError
@@ -98,7 +97,7 @@ class Odometry:
         with _user_errors():
             settings = _config(config, overrides)
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
-            self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
+            self._sizes = {name: mounted.camera.size for name, mounted in loaded.sides}
             run_geometry = geometry(loaded, settings.panorama)
             # `process` gets both images of a pair at once, whatever the time between their exposures.
             pair_config = replace(settings.pair, tolerance_ms=1e3 * MAX_SKEW_S)
@@ -169,7 +168,7 @@ class Odometry:
 
     def _checked(self, name: Camera, image: InputImage) -> GreyImage:
         """Return the image, contiguous; OmnidError where it is not one of this camera."""
-        width, height = self._cameras[name].size
+        width, height = self._sizes[name]
         found = type(image).__name__
         if isinstance(image, np.ndarray):
             if image.shape == (height, width) and image.dtype == np.uint8:

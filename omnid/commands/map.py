@@ -9,16 +9,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
+from calib.rig_file import png
 from omnid.commands import options
 from omnid.core.places import place_views
 from omnid.core.places.place_map import PlaceMap, PlaceRig
 from omnid.diagnostics.status import show_progress
 from omnid.errors import OmnidError
-from omnid.formats.exports import write_grid, write_ply
+from omnid.formats.exports import write_grid, write_ply, write_whole
 from omnid.formats.place_file import read_places, write_places
-from omnid.formats.plan import drawn_heights
+from omnid.formats.plan import drawn_heights, plan_view
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.sinks.files import check_outputs, write_plan
+from omnid.sinks.files import check_outputs
 from omnid.stages.obstacles import FLOOR_WARNING
 
 MAP: Final = "map FILE.omap  a map of places"
@@ -110,7 +111,8 @@ def export(args: argparse.Namespace) -> int:
         height_m = float(rig.T_base_rect[2, 3])
         low_m, high_m = (height_m + at_m for at_m in drawn_heights(height_m))
         paths, loops = place_views.paths_xy(places, rig), place_views.loops_xy(places, rig)
-        write_plan(args.plan, place_views.landmarks(places, rig, args.cell), paths, (low_m, high_m), loops)
+        points = place_views.landmarks(places, rig, args.cell)
+        write_whole(args.plan, png(plan_view(points, paths, heights_m=(low_m, high_m), loops_xy=loops)))
     options.print_entries({"written": ", ".join(str(path) for _, path in named)})
     return 0
 

@@ -37,7 +37,7 @@ from omnid.engine.robot_clock import RobotClock
 from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.plain_text import one_line
 from omnid.runs.files import RunPlaces
-from omnid.runs.wiring import BACKGROUND, BUS, Inputs, Session, run_to_end, wire
+from omnid.runs.wiring import BACKGROUND, BUS, Inputs, Leaving, Session, run_to_end, wire
 from omnid.settings import dump
 from omnid.sinks.encoder import BusSink, Encoder, PanoramaSink
 from omnid.sinks.recorder import Recorder
@@ -178,10 +178,10 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         navigation = graph.inlet(topics.MAX_OPEN), states
     saves = graph.inlet(topics.MAX_OPEN) if run_places.is_extended else None
-    reports = graph.inlet(1)  # the status
-    inputs = Inputs(frames, run_places, controller, navigation, saves, reports, config.live.cloud_s)
+    inputs = Inputs(frames, run_places, controller, navigation, saves, config.live.cloud_s)
     streams = wire(config, inputs, front_end, graph)
-    pairs, poses = streams.pairs, streams.poses
+    pairs, poses, reports = streams.pairs, streams.poses, graph.inlet(1)
+    streams.leaving.append(Leaving("status", reports))
 
     # 3. The sinks.
     exposure = ExposureControl(UsefulArea(rig, front_end.geometry.cylinder), config.cameras, robot.states)

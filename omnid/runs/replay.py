@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig import Rig
-from calib.rig_file import read_rig, rig_toml
+from calib.rig_file import png, read_rig, rig_toml
 from drivers.frame import Frame
 from drivers.logs.log_reader import WHOLE, LogCameras, LogReader, MotionTopics
 from drivers.motion import MotionSample
@@ -29,8 +29,8 @@ from omnid.diagnostics.status import RunCounters, RunStatistics, input_warnings,
 from omnid.engine.graph import POLL_S, Graph, Sink, sleep_until
 from omnid.engine.robot_clock import log_time
 from omnid.errors import OmnidError
-from omnid.formats.exports import write_ply
-from omnid.formats.plan import drawn_heights
+from omnid.formats.exports import write_ply, write_whole
+from omnid.formats.plan import drawn_heights, plan_view
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import MapUpdate, PlaceUpdate
 from omnid.recordings.evaluation import Metrics, evaluate
@@ -38,7 +38,7 @@ from omnid.runs.files import RunPlaces
 from omnid.runs.wiring import BACKGROUND, Inputs, Session, attached_rig, run_to_end, wire
 from omnid.settings import dump
 from omnid.sinks.encoder import BusSink, Encoder, Outgoing
-from omnid.sinks.files import TrajectoryFile, check_outputs, write_plan, write_trajectory
+from omnid.sinks.files import TrajectoryFile, check_outputs, write_trajectory
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.mapping import Places
@@ -200,7 +200,10 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         if plan := options.plan:
             heights_m = drawn_heights(rig.height_m(config.obstacles.scan.floor_m) or 0.0)
             graph.sink(
-                "plan", lambda now: write_plan(plan, now.points, now.path_xy, heights_m), maps, thread=BACKGROUND
+                "plan",
+                lambda now: write_whole(plan, png(plan_view(now.points, now.path_xy, heights_m=heights_m))),
+                maps,
+                thread=BACKGROUND,
             )
         if options.publish:
             bus = session.open_bus(rig, gives_time=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -35,7 +34,7 @@ from omnid.messages import (
 )
 from omnid.runs.files import RouteFiles, RunPlaces
 from omnid.settings import dump
-from omnid.sinks.drive import LiveDrive, arming_answers, navigation_answers, send_scan, send_setpoint
+from omnid.sinks.drive import LiveDrive, arming_answers, navigation_answers
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.stages.mapping import MapGrid, Mapping, Places
@@ -43,7 +42,6 @@ from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import Obstacles
 from omnid.transport import status_names
 from omnid.transport.bus import Bus
-from omnid.transport.codec import Diagnostics
 from omnid.transport.topics import MAX_OPEN, Answers
 
 BUS_S: Final = 3.0  # Time until a bus must be closed.
@@ -96,7 +94,7 @@ class Session:
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
         """Return the geometry of the rig; its missing masks are looked for in frames of a log."""
         rig = with_rims(rig, frames)
-        for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
+        for name, camera in rig.sides:
             if camera.mask is None and not sees_directly(camera.camera):
                 self.warn(
                     f"no mirror rim is known of the {name} camera: the largest disc is used; give it in the rig's file "
@@ -135,7 +133,6 @@ class Inputs:
     # Requests to the navigation, and the states of the controller; None: the run does not navigate.
     navigation: tuple[Stream[NavigationCommand], Stream[ControllerState]] | None = None
     saves: Stream[int] | None = None  # ids of requests to save the map; None: it is saved at the end only
-    reports: Stream[Diagnostics] | None = None  # the status of a live run
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
 
@@ -157,7 +154,7 @@ class Streams:
     in_map: Stream[PlaceUpdate] | None
     scans: Stream[ObstacleScan] | None
     ways: Stream[NavigationUpdate] | None
-    leaving: Sequence[Leaving]
+    leaving: list[Leaving]
     answers: Sequence[Stream[Answers]]  # to requests
     places: Places | None  # the stage of `in_map`
 
@@ -175,8 +172,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
     thread each. Work that the wheels do not wait for shares one: the map, its drawing and encoding, and file sinks.
     """
     geometry, run_map, controller = front_end.geometry, inputs.map, inputs.controller
-    T_base_rig = geometry.rig.T_base_rig
-    T_base_rect = T_base_rig @ geometry.T_rig_rect
+    T_base_rig, T_base_rect = geometry.rig.T_base_rig, geometry.T_base_rect
     places, in_map, scans, ways = None, None, None, None
     answers: list[Stream[Answers]] = []
 
@@ -187,8 +183,10 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
     leaving = [Leaving("poses", poses)]
 
     # 2. Poses go to the controller, which waits for no stage.
+    drive: LiveDrive | None = None
     if controller is not None:
-        graph.sink("controller", LiveDrive(controller, T_base_rig, front_end.health), poses, thread=poses.thread)
+        drive = LiveDrive(controller, T_base_rig, front_end.health)
+        graph.sink("controller", drive, poses, thread=poses.thread)
         leaving.append(Leaving("drive", graph.source("drive", controller.commands, wake=controller.end)))
 
     # 3. Poses give the map, the pose in it, and the obstacles. A map that is extended needs no reader.
@@ -204,8 +202,8 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
     if config.obstacles.enabled:
         scans = graph.stage("obstacles", Obstacles(geometry, config.obstacles), poses)
         leaving.append(Leaving("scan", scans))
-        if controller is not None:
-            graph.sink("controller-scan", partial(send_scan, controller), scans, thread=scans.thread)
+        if drive is not None:
+            graph.sink("controller-scan", drive, scans, thread=scans.thread)
 
     # 4. All of them, and requests, give the way to drive. Routes and copies of the map are written by another thread.
     if in_map is not None and inputs.saves is not None:
@@ -224,8 +222,6 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
         answers.append(graph.stage("arming", arming_answers, states, thread=states.thread))
         answers.append(graph.stage("answers", navigation_answers, ways, thread=ways.thread))
         answers.append(graph.sink("taught", files.write, ways, thread=FILES))
-        if controller is not None:
-            graph.sink("planner-drive", partial(send_setpoint, controller), ways, thread=ways.thread)
-    if inputs.reports is not None:
-        leaving.append(Leaving("status", inputs.reports))
+        if drive is not None:
+            graph.sink("planner-drive", drive, ways, thread=ways.thread)
     return Streams(pairs, poses, maps, in_map, scans, ways, leaving, answers, places)

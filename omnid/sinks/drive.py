@@ -13,6 +13,7 @@ from calib import se3
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerState
+from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate
@@ -25,31 +26,26 @@ NAVIGATION_SENDER: Final = "navigation"  # identity of the sender, which keeps o
 
 
 class LiveDrive:
-    """Sends the poses of `omnid run` to the controller; setpoints come from the network."""
+    """Sends the controller what it drives by: poses, the obstacles around the base, setpoints of the navigation."""
 
     def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64], health: RigHealth) -> None:
         """health: of the rig; the wheels have no pose to turn by until the first pairs were judged."""
         self._link, self._T_base_rig, self._health = link, T_base_rig, health
 
-    def process(self, odometry: OdometryUpdate) -> None:
-        """Send a pose."""
-        if not self._health.is_undecided:
-            self._link.send(controller_pose(odometry, self._T_base_rig))
+    def process(self, message: OdometryUpdate | ObstacleScan | NavigationUpdate) -> None:
+        """Send a message; a setpoint with a stamp of now: a source of higher priority overrides it."""
+        match message:
+            case OdometryUpdate():
+                if not self._health.is_undecided:
+                    self._link.send(controller_pose(message, self._T_base_rig))
+            case ObstacleScan():
+                self._link.send(controller_scan(message))
+            case NavigationUpdate(setpoint=Setpoint() as setpoint):
+                self._link.send(TimedSetpoint(time.monotonic_ns(), setpoint, PLANNER, NAVIGATION_SENDER))
 
     def finish(self) -> None:
         """Have the wheels slow down to a stop: there will be no more poses."""
         self._link.end()
-
-
-def send_setpoint(link: DriveLink, update: NavigationUpdate) -> None:
-    """Send the setpoint of the navigation, with a stamp of now; a source of higher priority overrides it."""
-    if update.setpoint is not None:
-        link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
-
-
-def send_scan(link: DriveLink, scan: ObstacleScan) -> None:
-    """Send the obstacles around the base."""
-    link.send(controller_scan(scan))
 
 
 def arming_answers(state: ControllerState) -> Answers:

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Final, TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
-from omnid.formats.exports import write_whole
-from omnid.formats.plan import plan_view
 from omnid.formats.tum import tum_row
 from omnid.messages import OdometryUpdate
 
@@ -92,15 +88,3 @@ def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np
             file.write(stamp_ns, T)
     finally:
         file.finish()
-
-
-def write_plan(
-    path: Path,
-    points: MapPoints,
-    path_xy: NDArray[np.float64],
-    heights_m: tuple[float, float],
-    loops_xy: Iterable[NDArray[np.float64]] = (),
-) -> None:
-    """Write the plan view of points between two heights [m], as `plan_view` draws it. Raises OmnidError."""
-    image = plan_view(points, path_xy, heights_m=heights_m, loops_xy=loops_xy)
-    write_whole(path, cv2.imencode(".png", image)[1].tobytes())

@@ -18,13 +18,12 @@ from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.rig_error import RigError
-from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.recognition import Relocaliser
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.types.panorama import Panoramas
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import FramePair, OdometryUpdate, StereoDepth
-from omnid.stages.geometry import DenseDepths, Dewarp, Geometry
+from omnid.stages.geometry import DenseDepths, Dewarp, Geometry, stereo_frame
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
@@ -54,7 +53,7 @@ class FrontEnd:
         self.dense = DenseDepths(geometry, config.stereo_settings())
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
-        self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
+        self._T_base_rect = geometry.T_base_rect
         self._last_ns: int | None = None
         self._unchecked: StereoDepth | None = None  # the last pair, if it is to be checked with its motion
         self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, if its pose was known well
@@ -103,16 +102,7 @@ class FrontEnd:
             dt_s = (pair.stamp_ns - last_ns) * S_PER_NS
             interval_s = sensors.seconds(last_ns), sensors.seconds(pair.stamp_ns)
         # 3. The pose of the rectified frame.
-        frame = StereoFrame(
-            pair.seq,
-            pair.lower,
-            pair.upper,
-            lambda exposure: self.dense.points(pair, exposure).disparity,
-            np.zeros_like(pair.visible) if pair.light.is_noise else pair.usable,
-            pair.times,
-            interval_s,
-            lost=pair.tiles.lost_pixels(pair.visible.shape),
-        )
+        frame = stereo_frame(pair, lambda exposure: self.dense.points(pair, exposure).disparity, interval_s)
         estimate = self._method.process(frame, dt_s)
         # 4. Compare its step with wheels and gyro over seconds.
         if estimate.step is not None and last_ns is not None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder, Maps, fit_cylinder, remap_tables, visible
-from calib.rig import MountedCamera, Rig
+from calib.rig import Rig
 from calib.rim import find_rim
 from drivers.frame import Camera, Frame
 from drivers.jpeg import Steps
@@ -25,6 +25,7 @@ from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.line_times import RawImage
+from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.stereo.matcher import Matcher
 from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
 from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
@@ -58,6 +59,11 @@ class Geometry:
         """Transform (4, 4) from the rectified frame, in which epipolar lines are columns, to the rig frame."""
         return se3.inverse(self.rig.T_rect_rig)
 
+    @property
+    def T_base_rect(self) -> Array:
+        """Transform (4, 4) from the rectified frame to the base."""
+        return np.asarray(self.rig.T_base_rig @ self.T_rig_rect)
+
     def model(self, noise_px: float) -> StereoModel:
         """Return the measurement model of corners located with a standard deviation of noise_px."""
         return StereoModel(self.cylinder, self.rig.baseline_m, noise_px)
@@ -73,7 +79,7 @@ def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
 
     A rim is sought in the maximum of the images: a single one may be dark on one side.
     """
-    mounted: dict[Camera, MountedCamera] = {"lower": rig.lower, "upper": rig.upper}
+    mounted = dict(rig.sides)
     missing = [name for name, camera in mounted.items() if camera.mask is None]
     decode, brightest = Decoder(rig), dict[Camera, NDArray[np.uint8]]()
     for frame in islice(frames, RIM_FRAMES if missing else 0):
@@ -170,6 +176,17 @@ def _without_margin(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.boo
     inner = cv2.erode(region.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=1) > 0
     inner[: margin_px + 1], inner[len(inner) - margin_px - 1 :] = False, False
     return inner
+
+
+def stereo_frame(
+    pair: Panoramas,
+    disparities: Callable[[Exposure | None], NDArray[np.float32]],
+    interval_s: tuple[float, float] | None = None,
+) -> StereoFrame:
+    """Return a pair as odometry and places take it; disparities, interval_s: see StereoFrame."""
+    usable = np.zeros_like(pair.visible) if pair.light.is_noise else pair.usable
+    lost = pair.tiles.lost_pixels(pair.visible.shape)
+    return StereoFrame(pair.seq, pair.lower, pair.upper, disparities, usable, pair.times, interval_s, lost=lost)
 
 
 class DenseDepths:

@@ -15,11 +15,10 @@ from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.core.mapping.voxel_map import ThinnedPath, VoxelMap
 from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.obstacles.settings import ScanSettings
-from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import SEARCHES, MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.messages import DensePoints, GridUpdate, MapKeyframes, MapUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.stages.geometry import DenseDepths, Geometry
+from omnid.stages.geometry import DenseDepths, Geometry, stereo_frame
 from omnid.stages.obstacles import Obstacles, floor_frame
 from omnid.tracking_state import MapState, TrackingState
 
@@ -207,13 +206,9 @@ class Places:
 
     def _frame(self, odometry: OdometryUpdate) -> OdometryFrame:
         """Return the frame in terms of the rectified frame."""
-        depth, pair = odometry.depth, odometry.depth.panoramas
-        usable = np.zeros_like(pair.visible) if pair.light.is_noise else pair.usable
-        stereo = StereoFrame(
-            odometry.seq, pair.lower, pair.upper, lambda _: self._dense.of(depth).disparity, usable, pair.times
-        )
+        depth = odometry.depth
         return OdometryFrame(
-            stereo,
+            stereo_frame(depth.panoramas, lambda _: self._dense.of(depth).disparity),
             odometry.stamp_ns,
             odometry.T_odom_rect,
             odometry.covariance_rect,

@@ -76,7 +76,7 @@ class Obstacles:
         self._has_tables = False  # of the floor, which the visible pixels of the first pair make
         self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, config.scan)
         self._tracker = MovingTracker()
-        self._T_base_rect = geometry.rig.T_base_rig @ geometry.T_rig_rect
+        self._T_base_rect = geometry.T_base_rect
         # A direction of the cameras is one of the base only far away, because the viewpoint may lie off its origin.
         self._ranges_m = (*(config.scan.max_range_m / 2**k for k in range(6)), math.inf)
         self._last_ns: int | None = None

@@ -60,7 +60,7 @@ class Decoder:
     """
 
     def __init__(self, rig: Rig) -> None:
-        self._sizes: dict[Camera, tuple[int, int]] = {"lower": rig.lower.camera.size, "upper": rig.upper.camera.size}
+        self._sizes = {name: mounted.camera.size for name, mounted in rig.sides}
         self._fitted: set[Camera] = set()
         self.broken = 0
         self.first_error = ""

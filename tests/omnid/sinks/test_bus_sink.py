@@ -23,7 +23,7 @@ from omnid.core.odometry.stereo_frame import Features
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.sinks.drive import navigation_answers, send_setpoint
+from omnid.sinks.drive import LiveDrive, navigation_answers
 from omnid.sinks.encoder import CLOUD_POINTS, BusSink, Encoder, Outgoing, PanoramaSink
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PlanarPath, decode_pose
@@ -174,12 +174,12 @@ class Link:
 
 
 def test_setpoints_and_answers_of_the_navigation_are_sent() -> None:
-    link: Any = Link()
+    link, health = cast("Any", Link()), cast("Any", None)
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
     refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
     assert navigation_answers(update) == {4: Answer(True, "accepted; navigation: paused: by a request")}
     assert navigation_answers(refused) == {5: Answer(False, "no route lost")}
     for each in (update, refused):
-        send_setpoint(link, each)
+        LiveDrive(link, np.eye(4), health).process(each)
     (sent,) = link.setpoints
     assert (sent.setpoint, sent.source) == (AHEAD, PLANNER)

@@ -23,6 +23,7 @@ from omnid.engine.robot_clock import RobotClock
 from omnid.messages import FramePair, MapUpdate, OdometryUpdate, StereoDepth
 from omnid.runs.live import open_recorder
 from omnid.sinks.encoder import Encoder
+from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import ERROR, OK, Diagnostics, DiagnosticStatus
 from omnid.transport.status_names import RECORDING, entry
 from tests.drivers.logs.mcap_logs import jpeg
@@ -60,8 +61,8 @@ def set_clock() -> RobotClock:
     return SetClock(OFFSET_NS).clock()
 
 
-def in_files(clock: RobotClock) -> Encoder:
-    return Encoder(make_rig(size=256), 6.0, clock.segment_unix_ns)
+def of_run(config: Config, clock: RobotClock, rig: str = "") -> Recorder:
+    return open_recorder(config, rig, clock, Encoder(make_rig(size=256), 6.0, clock.segment_unix_ns))
 
 
 def recorded(folder: Path) -> list[Path]:
@@ -88,8 +89,7 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
 def test_a_recording_of_fewer_images_holds_whole_pairs(tmp_path: Path, skew_ns: int) -> None:
     """Of three seconds at 30 Hz 15 pairs at 5 Hz; the images of each are as far apart as the cameras are."""
     config = settings(tmp_path, images_hz=5.0)
-    clock = set_clock()
-    recorder = open_recorder(config, "", clock, in_files(clock))
+    recorder = of_run(config, set_clock())
     for n in range(92):
         lower, upper = frame(n, "lower"), frame(n, "upper")
         upper = replace(upper, stamp_ns=upper.stamp_ns + skew_ns)
@@ -108,8 +108,7 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
-    of_run = set_clock()
-    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", of_run, in_files(of_run))
+    recorder = of_run(settings(tmp_path / "log"), set_clock(), "version = 1")
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
@@ -150,12 +149,11 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
     """The oldest files are deleted by their order in the run, whatever their names say."""
     computer = SetClock(OFFSET_NS)
     computer.advance(5.0)
-    of_run = computer.clock()
     monkeypatch.setattr(
         RecordConfig, "rotation", lambda _: RotationSettings(file_bytes=10**6, keep_bytes=10**6 + 65_000, free_bytes=0)
     )
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", of_run, in_files(of_run))
+    recorder = of_run(config, computer.clock())
     for n in range(30):
         stamp_ns = 5 * 10**9 + n * 10**8
         for camera in ("lower", "upper"):
@@ -193,8 +191,7 @@ def attached(path: Path) -> list[str]:
 def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(10**9, 10**10, 0, file_s=1.0))
     config = settings(tmp_path / "log")
-    clock = set_clock()
-    recorder = open_recorder(config, "", clock, in_files(clock))
+    recorder = of_run(config, set_clock())
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=5 * 10**9 + n * 10**8))
     recorder.close()
