@@ -10,13 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from drivers.frame import Frame
 from drivers.jpeg import Steps
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.motion_monitor import AGREE, Conflict
-from omnid.core.frames import BaseMotion, base_pose
+from omnid.core.frames import BodyMotion
 from omnid.core.mapping.scan_grid import Grid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.navigation.requests import TaughtRoute
@@ -98,11 +97,9 @@ class OdometryUpdate:
         """Position (3,) of the rig in odom, m: the last column of T_odom_rig."""
         return self.T_odom_rig[:3, 3]
 
-    def of_base(self, T_base_rig: Array) -> BaseMotion:
+    def of_base(self, T_base_rig: Array) -> BodyMotion:
         """Return the motion of the base that carries the rig."""
-        A = se3.adjoint(T_base_rig)
-        T_odom_base, covariance = base_pose(self.T_odom_rig, self.covariance, T_base_rig)
-        return BaseMotion(T_odom_base, covariance, A @ self.velocity, A @ self.velocity_covariance @ A.T)
+        return BodyMotion(self.T_odom_rig, self.covariance, self.velocity, self.velocity_covariance).of(T_base_rig)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,13 +22,25 @@ from calib import se3
 Array = NDArray[np.float64]
 
 
-class BaseMotion(NamedTuple):
-    """Pose and velocity of the base; odom is here the base's frame at the first pair."""
+class BodyMotion(NamedTuple):
+    """Pose and velocity of a frame on the body of the robot: rect, rig or base. odom is that frame at the start."""
 
-    T_odom_base: Array  # (4, 4)
-    covariance: Array  # (6, 6) [t; r] in the axes of the base
-    velocity: Array  # (6,) m/s, rad/s in the base frame
+    T_odom_b: Array  # (4, 4)
+    covariance: Array  # (6, 6) [t; r] of the pose in the axes of the frame
+    velocity: Array  # (6,) m/s, rad/s in the frame
     velocity_covariance: Array  # (6, 6)
+
+    def of(self, T_c_b: Array) -> BodyMotion:
+        """Return the motion of another frame c on the same body."""
+        A = se3.adjoint(T_c_b)
+        pose = carried(self.T_odom_b, self.covariance, T_c_b)
+        return BodyMotion(*pose, A @ self.velocity, A @ self.velocity_covariance @ A.T)
+
+
+def carried(T_a_b: Array, covariance: Array, T_c_b: Array) -> tuple[Array, Array]:
+    """Return the pose, and its covariance, of another frame c on the body of b; a is where either of them began."""
+    A = se3.adjoint(T_c_b)
+    return T_c_b @ T_a_b @ se3.inverse(T_c_b), A @ covariance @ A.T
 
 
 def in_outer_axes(T_a_b: Array, covariance: Array) -> Array:
@@ -36,9 +48,3 @@ def in_outer_axes(T_a_b: Array, covariance: Array) -> Array:
     R = np.zeros((6, 6))
     R[:3, :3] = R[3:, 3:] = T_a_b[:3, :3]
     return np.asarray(R @ covariance @ R.T)
-
-
-def base_pose(T_odom_rig: Array, covariance: Array, T_base_rig: Array) -> tuple[Array, Array]:
-    """Return T_odom_base and its body-fixed covariance, for those of the rig; the same for a pose in the map."""
-    A = se3.adjoint(T_base_rig)
-    return T_base_rig @ T_odom_rig @ se3.inverse(T_base_rig), A @ covariance @ A.T

@@ -14,7 +14,7 @@ from calib.rig import Rig
 from drivers.frame import Frame
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
-from omnid.core.frames import base_pose, in_outer_axes
+from omnid.core.frames import carried, in_outer_axes
 from omnid.core.mapping.voxel_map import ThinnedPath
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
@@ -145,11 +145,11 @@ class Encoder:
             self._state_in_map = update.state
             status = entry(PLACES, {Key.STATE: update.state})
             yield "status", codec.diagnostics_cdr(stamp_ns, [status])
-        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
+        T_map_base, covariance = carried(update.T_map_rig, update.covariance, self._T_base_rig)
         pose = (T_map_base, np.ravel(in_outer_axes(T_map_base, covariance)))
         yield MAP_POSE, codec.encoded(codec.MAP_POSE_SCHEMA, (stamp_ns, "map"), pose)
         if update.is_known:  # A transform has no covariance to state that it is unknown.
-            T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self._T_base_rig)
+            T_map_odom, _ = carried(update.T_map_odom, update.covariance, self._T_base_rig)
             yield "/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)])
 
 

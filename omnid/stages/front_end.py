@@ -11,6 +11,7 @@ from calib import se3
 from calib.fit.rig_uncertainty import motion_errors
 from omnid.config import Config
 from omnid.core.control.motion_monitor import AGREE, Conflict
+from omnid.core.frames import BodyMotion
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
@@ -51,9 +52,7 @@ class FrontEnd:
         self.pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
         self.dewarp = Dewarp(geometry, config.panorama)
         self.dense = DenseDepths(geometry, config.stereo_settings())
-        self._T_rig_rect = geometry.T_rig_rect
-        self._to_rig = se3.adjoint(self._T_rig_rect)
-        self._T_base_rect = geometry.T_base_rect
+        self._T_rig_rect, self._T_base_rect = geometry.T_rig_rect, geometry.T_base_rect
         self._last_ns: int | None = None
         self._unchecked: StereoDepth | None = None  # the last pair, if it is to be checked with its motion
         self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, if its pose was known well
@@ -169,13 +168,11 @@ class FrontEnd:
         if before is not None and is_known and before[1].resets == estimate.resets:
             T_earlier_now = se3.inverse(before[1].T_odom_rect) @ T_odom_rect
             earlier = EarlierView(before[0].lower, before[0].usable, T_earlier_now, before[1].exposure)
+        motion = BodyMotion(T_odom_rect, covariance, estimate.velocity, estimate.velocity_covariance)
         return OdometryUpdate(
             pair.seq,
             pair.stamp_ns,
-            self._T_rig_rect @ T_odom_rect @ se3.inverse(self._T_rig_rect),
-            self._to_rig @ covariance @ self._to_rig.T,
-            self._to_rig @ estimate.velocity,
-            self._to_rig @ estimate.velocity_covariance @ self._to_rig.T,
+            *motion.of(self._T_rig_rect),
             state,
             estimate.resets,
             estimate.inliers,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import Config, MappingConfig
+from omnid.core.frames import carried
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, FreeRanges, RangeScan, point_scan, seen_from
 from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.core.mapping.voxel_map import ThinnedPath, VoxelMap
@@ -168,13 +169,13 @@ class Places:
             self._keyframes = MapKeyframes(stamps_ns, {id: places.poses[id] for id in ids})
             self._copied_scans, self.counts = scans, self._localiser.counts
         # 3. The message, in the frame of the rig.
-        T_map_odom, adjoint = self._in_rig(pose.T_map_odom), se3.adjoint(self._T_rig_rect)
+        T_map_odom, covariance = carried(pose.T_map_odom, pose.covariance, self._T_rig_rect)
         return PlaceUpdate(
             odometry.seq,
             odometry.stamp_ns,
             T_map_odom,
             T_map_odom @ odometry.T_odom_rig,
-            adjoint @ pose.covariance @ adjoint.T,
+            covariance,
             pose.state,
             pose.keyframe,
             self._in_rig(pose.T_keyframe_rect),

@@ -12,7 +12,7 @@ from calib import se3
 from calib.se2_arrays import planar
 from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.control_law import ControllerState
-from omnid.core.frames import base_pose, in_outer_axes
+from omnid.core.frames import carried, in_outer_axes
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
@@ -148,8 +148,8 @@ class NavigationStage:
     def _place(self, update: PlaceUpdate) -> None:
         if update.stamp_ns < self._reset_ns:
             return
-        T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
-        T_map_odom = self._T_base_rig @ update.T_map_odom @ self._T_rig_base
+        T_map_base, covariance = carried(update.T_map_rig, update.covariance, self._T_base_rig)
+        T_map_odom, _ = carried(update.T_map_odom, update.covariance, self._T_base_rig)
         in_plane = in_outer_axes(T_map_base, covariance)[:2, :2]
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(in_plane)[-1]), 0.0))  # NaN stays NaN in this order
         self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m, update.stamp_ns)
