@@ -24,7 +24,6 @@ from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
-from omnid.core.stereo.photometry import Light
 from omnid.core.types.panorama import Panoramas
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
@@ -83,8 +82,6 @@ class OdometryUpdate:
     tracks: int  # landmarks that were tracked
     depth: StereoDepth
     features: Features = field(default_factory=Features)  # shown by viewers; empty with the method of the paper
-    light: Light = field(default_factory=Light)
-    motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     is_keyframe: bool = False  # odometry needs its dense depth in any case
     conflict: Conflict = AGREE  # whether images, wheels and gyro show the same motion
     image_fault: str = ""  # fault of torn or displaced images of a camera; empty: none

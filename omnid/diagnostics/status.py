@@ -59,9 +59,9 @@ class RunStatistics:
         self._position, self.newest = position, odometry
         # 2. States of poses and images.
         self.states[odometry.state] += 1
-        self.dark_pairs += odometry.light.is_too_dark
-        columns = odometry.depth.panoramas.tiles.columns
-        self.lost_parts.update(side for side, found in columns.items() if found.any())
+        pair = odometry.depth.panoramas
+        self.dark_pairs += pair.light.is_too_dark
+        self.lost_parts.update(side for side, found in pair.tiles.columns.items() if found.any())
         self.poses += 1
 
 
@@ -228,7 +228,7 @@ class StatusCollector:
         if newest is None:
             return {"_stale": "no pose yet"}
         state, fault = newest.state, newest.image_fault
-        if newest.light.is_too_dark and state != TrackingState.LOST:
+        if newest.depth.panoramas.light.is_too_dark and state != TrackingState.LOST:
             fault = "it is too dark"
         of_tracking = "_warning" if fault else "_ok"
         severity = {TrackingState.LOST: "_error", TrackingState.TRACKING: of_tracking}.get(state, "_warning")

@@ -138,8 +138,6 @@ class Stage(Protocol[In_contra, Out_co]):
 
 # A stage or a sink without a state, and without results at the end, is a function.
 Step: TypeAlias = Stage[In_contra, Out_co] | Callable[[In_contra], Out_co | None]
-Sink: TypeAlias = Stage[In_contra, None]
-Output: TypeAlias = Sink[In_contra] | Callable[[In_contra], None]
 
 
 def no_op(*_: object) -> None:

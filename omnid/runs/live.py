@@ -16,7 +16,7 @@ from contextlib import ExitStack, closing, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
@@ -58,9 +58,6 @@ class LiveCamera(FrameSource, Protocol):
     state: CameraState
 
 
-OpenCamera: TypeAlias = Callable[[Camera], LiveCamera]
-
-
 class LiveRobot(Protocol):
     """A robot, or a simulated one, as a live run sees it."""
 
@@ -81,7 +78,7 @@ class ConnectedRobot:
 
     waits = False
 
-    def __init__(self, open_camera: OpenCamera, *, plays_log: bool = False) -> None:
+    def __init__(self, open_camera: Callable[[Camera], LiveCamera], *, plays_log: bool = False) -> None:
         """plays_log: the images are those of a log, and samples of wheels and gyro are not used."""
         self._open_camera, self.brings_samples = open_camera, plays_log
         self.states: Mapping[Camera, CameraState] = {}

@@ -26,7 +26,7 @@ from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.status import RunCounters, RunStatistics, input_warnings, pair_loss
-from omnid.engine.graph import POLL_S, Graph, Sink, sleep_until
+from omnid.engine.graph import POLL_S, Graph, Step, sleep_until
 from omnid.engine.robot_clock import log_time
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply, write_whole
@@ -68,7 +68,7 @@ class ReplayOptions:
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     # Called ten times a second and at the end, with statistics, expected pairs, and whether the run has ended.
     progress: Callable[[RunStatistics, int | None, bool], object] | None = None
-    observer: Callable[[FrontEnd], Sink[Outgoing]] | None = None  # of all messages; excludes record
+    observer: Callable[[FrontEnd], Step[Outgoing, None]] | None = None  # of all messages; excludes record
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
@@ -239,24 +239,19 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
             {} if places is None else places.counts,
             pair_loss(front_end.pairing, read),
         )
-        if recorder is not None:
-            recorder.close()
-
         kept_stamps_ns, kept_poses, kept_covariances, kept_states = tuple(zip(*collected, strict=True)) or 4 * ((),)
 
         # 6. Poses in the map: corrected by its later loops, and as they were known while driving.
         corrected = [] if places is None else [places.corrected(each) for each in updates]
         in_map = np.array(corrected, float).reshape(-1, 4, 4)
         live = np.array([each.T_map_rig for each in updates], float).reshape(-1, 4, 4)
-        if options.map_tum and places is not None:
+        if options.map_tum and places is not None and updates:
             stamps_ns, known = np.array([each.stamp_ns for each in updates], np.int64), places.known(updates)
             if not known.all():
                 warnings.append(
                     f"{options.map_tum}: {len(known) - known.sum()} of {len(known)} poses are left out: no place of "
                     "the map was recognised there, so it is not known where in it they are"
                 )
-            if updates:  # The file of an earlier run must not pass for the result.
-                options.map_tum.write_bytes(b"")
             write_trajectory(options.map_tum, stamps_ns[known], in_map[known])
         return RunResult(
             np.array(kept_stamps_ns, np.int64),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -21,7 +21,7 @@ from omnid.controller.link import DriveLink
 from omnid.core.control.control_law import ControllerState
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.diagnostics.status import RunStatistics
-from omnid.engine.graph import Graph, Output, Poller, Stream, run_in_thread
+from omnid.engine.graph import Graph, Poller, Step, Stream, run_in_thread
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import (
@@ -75,21 +75,17 @@ def run_to_end(graph: Graph, run_places: RunPlaces) -> None:
     run_places.finish_run()
 
 
+@dataclass(slots=True)
 class Session:
-    """One run: its graph, its statistics and its outputs, which are closed in reverse order when `outputs` closes."""
+    """One run."""
 
-    def __init__(
-        self,
-        config: Config,
-        graph: Graph,
-        outputs: ExitStack,
-        warn: Callable[[str], None],
-        statistics: RunStatistics,
-    ) -> None:
-        """warn: takes a line for the user."""
-        self.config, self.graph, self.outputs, self.warn, self.statistics = config, graph, outputs, warn, statistics
-        # Numbers of the parts of a live run, by their names.
-        self.parts: dict[str, Callable[[], status_names.Stats]] = {}
+    config: Config
+    graph: Graph
+    outputs: ExitStack  # closes them in reverse order
+    warn: Callable[[str], None]  # takes a line for the user
+    statistics: RunStatistics
+    # Numbers of the parts of a live run, by their names.
+    parts: dict[str, Callable[[], status_names.Stats]] = field(default_factory=dict)
 
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
         """Return the geometry of the rig; its missing masks are looked for in frames of a log."""
@@ -158,7 +154,7 @@ class Streams:
     answers: Sequence[Stream[Answers]]  # to requests
     places: Places | None  # the stage of `in_map`
 
-    def publish(self, graph: Graph, sink: Output[Any]) -> None:
+    def publish(self, graph: Graph, sink: Step[Any, None]) -> None:
         """Have all messages that leave the run published."""
         for about, stream, thread in self.leaving:
             graph.sink(f"bus-{about}", sink, stream, thread=thread)

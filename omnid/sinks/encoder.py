@@ -126,7 +126,7 @@ class Encoder:
         yield "pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base)
         yield "/tf", codec.transform_cdr(stamp_ns, [("odom", "base_link", T_odom_base)])
         # 3. Samples of wheels and gyro up to the pair; those after it come with the next one again.
-        for sample in odometry.motion:
+        for sample in odometry.depth.panoramas.motion:
             if sample.stamp_ns > odometry.stamp_ns:
                 continue
             if isinstance(sample, WheelSample):

@@ -58,12 +58,8 @@ class TrajectoryFile:
         self._file: FileIO | None = None
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Write the row of a pose T_odom_rig."""
-        self.write(odometry.stamp_ns, odometry.T_odom_rig)
-
-    def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
-        """Write the row of a pose (4, 4). Raises OmnidError."""
-        row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
+        """Write the row of a pose T_odom_rig. Raises OmnidError."""
+        row = tum_row(odometry.stamp_ns, odometry.T_odom_rig).encode("ascii") + b"\n"
         try:
             if self._file is None:
                 self._file = self._path.open("wb", buffering=0)
@@ -81,10 +77,9 @@ class TrajectoryFile:
 
 
 def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
-    """Write poses (N, 4, 4) as TUM; without poses an existing file stays as it is. Raises OmnidError."""
-    file = TrajectoryFile(path)
+    """Write poses (N, 4, 4) as TUM. Raises OmnidError."""
+    rows = [tum_row(stamp_ns, T) + "\n" for stamp_ns, T in zip(stamps_ns.tolist(), poses, strict=True)]
     try:
-        for stamp_ns, T in zip(stamps_ns.tolist(), poses, strict=True):
-            file.write(stamp_ns, T)
-    finally:
-        file.finish()
+        path.write_text("".join(rows), "ascii")
+    except OSError as error:
+        raise OmnidError(f"{path}: cannot be written: {error.strerror or error}") from error

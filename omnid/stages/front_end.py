@@ -179,8 +179,6 @@ class FrontEnd:
             estimate.tracked,
             StereoDepth(pair, estimate.exposure, earlier),
             estimate.features,
-            pair.light,
-            pair.motion,
             estimate.is_keyframe,
             self.conflict,
             estimate.image_fault,

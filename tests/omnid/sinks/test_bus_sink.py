@@ -45,7 +45,7 @@ IMAGE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), np
 
 def odometry(seq: int) -> OdometryUpdate:
     T = se3.transform(np.eye(3), [1.0, 0.0, 0.0])
-    depth = cast("Any", SimpleNamespace(panoramas=SimpleNamespace(lower=PaddedPanorama(IMAGE, 16))))
+    depth = cast("Any", SimpleNamespace(panoramas=SimpleNamespace(lower=PaddedPanorama(IMAGE, 16), motion=())))
     features = Features(np.array([[3.4, 5.0], [7.0, 8.6]]), np.array([[1.0, 2.0]]))
     return OdometryUpdate(seq, 10**9 * seq, T, np.eye(6), np.zeros(6), np.eye(6), "degraded", 3, 5, 9, depth, features)
 
