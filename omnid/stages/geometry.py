@@ -19,7 +19,6 @@ from calib.panorama import Cylinder, Maps, fit_cylinder, remap_tables, visible
 from calib.rig import Rig
 from calib.rim import find_rim
 from drivers.frame import Camera, Frame
-from drivers.jpeg import Steps
 from omnid.config import PanoramaConfig, StereoConfig
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
@@ -100,18 +99,15 @@ class Dewarp:
         self._measured_ns: int | None = None  # stamp of the pair in which the noise was measured last
         self._pad_px, self._unpadded = config.pad_px, np.s_[:, config.pad_px : -config.pad_px]
         rig, self._cylinder = geometry.rig, geometry.cylinder
-        self._lower, self._upper = tables = [
-            remap_tables(rig, one, self._cylinder, config.pad_px) for one in (rig.lower, rig.upper)
-        ]
-        self._blur_px = _blur_px(tables)
-        both = visible(rig.lower, self._lower, config.rim_margin_px)
-        both &= visible(rig.upper, self._upper, config.rim_margin_px)
+        self._maps = {side: remap_tables(rig, one, self._cylinder, config.pad_px) for side, one in rig.sides}
+        self._blur_px = _blur_px([*self._maps.values()])
+        both = np.logical_and(*(visible(one, self._maps[side], config.rim_margin_px) for side, one in rig.sides))
         self._visible = np.ascontiguousarray(_without_margin(both, config.margin_px)[self._unpadded])
         if not self._visible.any():
             raise OmnidError("the cameras share no part of the panorama: check the rig's transforms and masks")
         self._tiles = TileMonitor(self._visible, tile_columns(self._cylinder))
         self._upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
-        (lower_u, lower_v), (upper_u, upper_v) = ([table[self._unpadded] for table in maps] for maps in tables)
+        (lower_u, lower_v), (upper_u, upper_v) = ([one[self._unpadded] for one in maps] for maps in self._maps.values())
         self.raw_images = (
             RawImage(lower_u, lower_v, rig.lower.camera.size),
             RawImage(upper_u, upper_v, rig.upper.camera.size),
@@ -121,14 +117,10 @@ class Dewarp:
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
         # 1. Rectify both images, with the padding and without; the noise is measured in some of the pairs.
-        raw: dict[Side, tuple[NDArray[np.uint8], Maps, Steps]] = {
-            "lower": (pair.lower, self._lower, pair.jpeg_steps[0]),
-            "upper": (pair.upper, self._upper, pair.jpeg_steps[1]),
-        }
         padded, grey = dict[Side, NDArray[np.uint8]](), dict[Side, NDArray[np.uint8]]()
-        for side, (image, maps, _) in raw.items():
+        for side, image in zip(SIDES, (pair.lower, pair.upper), strict=True):
             smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
-            padded[side] = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
+            padded[side] = np.asarray(cv2.remap(smooth, *self._maps[side], cv2.INTER_LINEAR), np.uint8)
             grey[side] = np.ascontiguousarray(padded[side][self._unpadded])
         if self._measured_ns is None or abs(pair.stamp_ns - self._measured_ns) >= NOISE_NS:
             self._measured_ns = pair.stamp_ns
@@ -149,10 +141,10 @@ class Dewarp:
                 gains[side],
                 cylinder.period_px,
                 cylinder.first,
-                raw[side][2],
+                steps,
                 cylinder.scale,
             )
-            for side in SIDES
+            for side, steps in zip(SIDES, pair.jpeg_steps, strict=True)
         )
         # 4. Exposure times of the pixels, and tiles of the images that are dead or blind.
         times = PixelTimes(pair.skew_s + self._upper_delay_s, *self._rows_s)

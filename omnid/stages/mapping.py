@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,10 +115,10 @@ class MapGrid:
         is_due = self._every_ns and update.stamp_ns - self._drawn_ns >= self._every_ns
         return self._update(update) if is_due else None
 
-    def finish(self) -> list[GridUpdate]:
-        """Return the final grid, if there was a keyframe."""
-        final = None if self._newest is None else self._update(self._newest)
-        return [] if final is None else [final]
+    def finish(self) -> Iterator[GridUpdate]:
+        """Yield the final grid, if it has changed."""
+        if self._newest is not None and (final := self._update(self._newest)) is not None:
+            yield final
 
     def _update(self, newest: PlaceUpdate) -> GridUpdate | None:
         if newest.scans is None or not newest.scans.scans or newest.scans is self._drawn:

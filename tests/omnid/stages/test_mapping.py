@@ -104,7 +104,7 @@ def test_a_grid_is_drawn_when_it_is_due_and_has_changed() -> None:
     assert given(stage, [grid_update(k, one if k < 7 else two) for k in range(1, 8)]) == [2, 7]
     # Nor scans of unknown place: of a saved map, or after a gap, until a place is recognised.
     assert stage.process(replace(grid_update(10, scans(4)), is_known=False)) is None
-    assert stage.finish() == []
+    assert list(stage.finish()) == []
     assert stage.process(grid_update(8, scans(3))) is None
     [last] = stage.finish()
     assert last.seq == 8 and last.grid.cells.max() == 100
