@@ -31,9 +31,10 @@ from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
 from omnid.core.odometry.image_breaks import ImageBreaks
 from omnid.core.odometry.line_times import RawImage
 from omnid.core.odometry.local_map import Keyframe, LocalMap
-from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
+from omnid.core.odometry.motion_filter import CAMERA_SIGMA, UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, OtherMotion
 from omnid.core.odometry.new_landmarks import located
+from omnid.core.odometry.pose_estimation import OUTLIER_SQUARED
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
@@ -199,6 +200,7 @@ class VisualOdometry:
             is_known = bool(plausible) and plausible[0].inliers >= limits.good_inliers
             return self._refuse(now, found, gap if is_known else None)
         estimate = self._other.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
+        estimate = self._at_rest(estimate)
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(now, estimate, is_reset=bool(np.linalg.norm(gap[3:]) > JUMP_RAD))
@@ -248,6 +250,14 @@ class VisualOdometry:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
         most_m = self._limits.max_speed_mps * now.since_fix_s
         return estimate.has_support(self._limits) and estimate.distance_m(self._T_odom_rect) <= most_m
+
+    def _at_rest(self, estimate: PoseEstimate) -> PoseEstimate:
+        """Return the estimate; if its step may be noise, at the last pose: noise would move a base at rest."""
+        step = _step(self._T_odom_rect, estimate.T_odom_rect)
+        information = np.linalg.inv(estimate.covariance) + np.diag(1.0 / CAMERA_SIGMA**2)
+        if step @ information @ step >= OUTLIER_SQUARED:
+            return estimate
+        return replace(estimate, T_odom_rect=self._T_odom_rect, covariance=estimate.covariance + np.outer(step, step))
 
     def _is_textured(self, now: _Prediction) -> bool:
         """True if the frame has enough corners for a map."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, TURN
+from tests.simulation.logs import SensorErrors
 
 Array = NDArray[np.float64]
 
@@ -19,18 +20,6 @@ T_RECT_BASE = se3.exp([0.1, -0.05, -0.4, 0.02, -0.01, 0.7])
 PAIR_S, WHEEL_S, GYRO_S = 0.1, 0.02, 0.01
 CAMERA_COVARIANCE = np.diag(np.repeat([1e-4, 5e-5], 3) ** 2)
 START_NS = 1_795_000_000_000_000_000
-
-
-@dataclass(frozen=True)
-class SensorErrors:
-    """Errors of the sensors."""
-
-    distance: float = 1.0  # metres of the base per metre of the wheels
-    turn: float = 1.0
-    wheel_offset_s: float = 0.0  # to be added to the stamps
-    gyro_offset_s: float = 0.0
-    bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    noise: float = 1.0  # of the ordinary noise
 
 
 def velocity(t_s: Array) -> tuple[Array, Array]:
@@ -59,13 +48,13 @@ def samples(errors: SensorErrors, start_s: float, end_s: float, rng: np.random.G
         found.append(
             WheelSample(
                 stamp_ns,
-                speed / errors.distance + errors.noise * rng.normal(0, 0.002),
-                rate / errors.turn + errors.noise * rng.normal(0, 0.004),
+                speed / errors.distance + rng.normal(0, errors.wheel_sigma[0]),
+                rate / errors.turn + rng.normal(0, errors.wheel_sigma[1]),
             )
         )
     times_s = np.arange(start_s, end_s - 1e-9, GYRO_S)
     for t_s, turn in zip(times_s, velocity(times_s)[1], strict=True):
-        rates = np.array([0, 0, turn]) + errors.bias_radps + errors.noise * rng.normal(0, 0.003, 3)
+        rates = np.array([0, 0, turn]) + errors.bias_radps + rng.normal(0, errors.gyro_sigma_radps, 3)
         found.append(GyroSample(START_NS + round((t_s - errors.gyro_offset_s) * 1e9), *rates))
     return found
 
@@ -160,17 +149,12 @@ def test_a_wheel_that_slips_in_the_dark_is_noticed_by_the_gyro() -> None:
         found = []
         for step_end in np.arange(moving + PAIR_S, moving + seconds, PAIR_S):
             new = samples(SensorErrors(), step_end - PAIR_S, step_end, rng)
-            motion.sensors.add([turning(sample, slip) for sample in new])
+            of_wheels = [one for one in new if isinstance(one, WheelSample)]
+            motion.sensors.add([one for one in new if isinstance(one, GyroSample)])
+            motion.sensors.add([replace(one, yaw_rate_radps=one.yaw_rate_radps + slip) for one in of_wheels])
             found.append(sensed(motion, step_end)[1])  # a single step may be a bump
         assert all(is_complete == (slip == 0) for is_complete in found[1:])
         moving += seconds
-
-
-def turning(sample: MotionSample, slip_radps: float) -> MotionSample:
-    """Return a sample, of wheels with so much more turn."""
-    if isinstance(sample, WheelSample):
-        return replace(sample, yaw_rate_radps=sample.yaw_rate_radps + slip_radps)
-    return sample
 
 
 def test_a_jerk_leaves_open_whether_the_motion_goes_on_as_before() -> None:
