@@ -250,7 +250,7 @@ class DenseDepths:
         views, motion_variance = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
         if exposure is not None:
             views, motion_model = exposure.corrected(views[:, :2], views[:, 2])
-            noise = motion_model.noise(exposure.motion)
+            noise = motion_model.noise
             motion_variance = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = views[:, 2] - views[:, 1]

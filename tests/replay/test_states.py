@@ -23,6 +23,8 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
 from tests.replay.edited import Image, Pixels, dark, images, repeat_lines, roll, save, shift, tear, turn
+from tests.simulation import build, write_log
+from tests.simulation.logs import Readout
 
 DARK_PAIRS = 20  # pairs, 2 s
 
@@ -202,3 +204,12 @@ def test_whole_images_are_not_suspected(course: Path) -> None:
     result = replay(course / "log.mcap", course / "rig.toml", overrides=["places.enabled=false"])
     assert not [line for line in result.warnings if line.startswith("images of the ")]
     assert set(map(str, result.states)) == {"tracking"}
+
+
+def test_cameras_of_a_shaken_rig_that_are_not_synchronised_have_whole_images(tmp_path: Path) -> None:
+    """Both flows are off in one way where the velocity between the exposures is not known exactly."""
+    made, readout = build("rooms", 9, 256, 100), Readout(1.4, (15.0, 15.0))
+    poses = made.poses[:16]
+    write_log(tmp_path, made.rig, poses, made.scene, seed=9, sensor=made.sensor, readout=readout)
+    result = replay(tmp_path / "log.mcap", tmp_path / "rig.toml", overrides=["places.enabled=false"])
+    assert set(result.states) == {"tracking"}, result.warnings

@@ -54,7 +54,7 @@ def contradicted(
     there = se3.apply(earlier.T_earlier_now, points)
     seen = cylinder.pixels(there)
     if earlier.exposure is not None:
-        seen -= earlier.exposure.shift(there).lower
+        seen -= earlier.exposure.shift(there).px[:, :2]
     chosen, middle = at_pixels(earlier.usable, seen) & cylinder.shows(seen[:, 0]), (cylinder.height - 1) / 2
     for at in (pixels, seen):
         chosen &= np.abs(at[:, 1] - middle) <= middle - HALF_PX

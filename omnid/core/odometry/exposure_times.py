@@ -46,20 +46,23 @@ NO_VELOCITY = RigVelocity(np.zeros(0), np.zeros((0, 0)))
 
 @dataclass(frozen=True, slots=True)
 class ViewShift:
-    """Differences between the views of N points at the stamp and the views when they were exposed."""
+    """What is added to the views of N points when they were exposed, for their views at the stamp."""
 
-    lower: Array  # (N, 2) px: column, row
-    upper: Array  # (N, 2) px
-    by_motion: Array  # (N, 4, K) derivatives by the velocity: of lower column and row, upper row and column
+    px: Array  # (N, 4): lower column and row, upper row and column
+    by_motion: Array  # (N, 4, K) its derivatives by the velocity
+    motion: RigVelocity
 
-    def noise(self, motion: RigVelocity) -> Array:
-        """Return the covariance (N, 3, 3) [px^2] of corrected views by the uncertainty of the velocity."""
+    @property
+    def noise(self) -> Array:
+        """Covariance (N, 3, 3) [px^2] of corrected views by the uncertainty of the velocity."""
         J = self.by_motion[:, :3]
-        return np.asarray(J @ motion.covariance @ np.swapaxes(J, 1, 2))
+        return np.asarray(J @ self.motion.covariance @ np.swapaxes(J, 1, 2))
 
-    def variance(self, motion: RigVelocity) -> Array:
-        """Return the variances (N, 4) [px^2], as in by_motion, by the uncertainty of the velocity."""
-        return np.asarray(np.einsum("nki,ij,nkj->nk", self.by_motion, motion.covariance, self.by_motion))
+    @property
+    def spread_px(self) -> Array:
+        """Two standard deviations (N,) of the upper column by the uncertainty of the velocity."""
+        J = self.by_motion[:, 3]
+        return np.asarray(2 * np.sqrt(np.einsum("ni,ij,nj->n", J, self.motion.covariance, J)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,17 +81,16 @@ class Exposure:
     def shift(self, points: Array) -> ViewShift:
         """Return the shifts of points (N, 3) [m] in the rectified frame at the stamp."""
         if self.times.is_synchronised:
-            none = np.zeros((len(points), 2))
-            return ViewShift(none, none, np.zeros((len(points), 4, 0)))
+            return ViewShift(np.zeros((len(points), 4)), np.zeros((len(points), 4, 0)), self.motion)
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
         seen = view(points, cylinder, baseline_m)
         lower_s, upper_s = self.times.lower(seen[:, :2]), self.times.upper(seen[:, [0, 2]])
         in_lower, in_upper = (view(self._later(points, s), cylinder, baseline_m) for s in (lower_s, upper_s))
-        lower, upper = seen[:, :2] - in_lower[:, :2], seen[:, [0, 2]] - in_upper[:, [0, 2]]
-        lower[:, 0], upper[:, 0] = cylinder.wrap(lower[:, 0]), cylinder.wrap(upper[:, 0])
+        px = np.column_stack([seen[:, :2] - in_lower[:, :2], (seen - in_upper)[:, [2, 0]]])
+        px[:, [0, 3]] = cylinder.wrap(px[:, [0, 3]])
         J = motion_jacobian(points, cylinder, baseline_m)[:, [0, 1, 2, 0]]
         times_s = np.column_stack([lower_s, lower_s, upper_s, upper_s])
-        return ViewShift(lower, upper, times_s[:, :, None] * J)
+        return ViewShift(px, times_s[:, :, None] * J, self.motion)
 
     def _later(self, points: Array, times_s: Array) -> Array:
         """Return points (N, 3) in the rectified frame at times (N,) after the stamp: exp(-V tau) p to second order."""
@@ -107,10 +109,10 @@ class Exposure:
         known = np.flatnonzero(disparity > 0)
         views = np.column_stack([pixels, pixels[:, 1] + disparity])[known]
         shift = self.shift(triangulate(views, self.model.cylinder, self.model.baseline_m))
-        # The lower pixel is known as seen: its view at the stamp differs by shift.lower.
+        # The lower pixel is known as seen: its view at the stamp differs by the shift.
         upper, spread_px = np.full((len(pixels), 2), np.nan), np.full(len(pixels), np.nan)
-        upper[known] = views[:, [0, 2]] + shift.lower - shift.upper
-        spread_px[known] = 2 * np.sqrt(shift.variance(self.motion)[:, 3])
+        upper[known] = views[:, [0, 2]] + shift.px[:, :2] - shift.px[:, [3, 2]]
+        spread_px[known] = shift.spread_px
         return upper, spread_px
 
     def corrected(self, pixels: Array, rows: Array) -> tuple[Array, ViewShift]:
@@ -126,7 +128,7 @@ class Exposure:
             points = triangulate(views, self.model.cylinder, self.model.baseline_m)
             known = np.isfinite(points).all(axis=1, keepdims=True)
             shift = self.shift(np.where(known, points, 1.0))
-            views = np.where(known, seen + np.column_stack([shift.lower, shift.upper[:, 1]]), np.nan)
+            views = np.where(known, seen + shift.px[:, :3], np.nan)
         return views, shift
 
     def column_shift(self, shape: tuple[int, int], pad_px: int) -> ColumnShift:
@@ -136,7 +138,7 @@ class Exposure:
         rows, columns = (grid_px * (np.arange(-(-size // grid_px)) + 0.5) - 0.5 for size in shape)
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         corrected = [self.corrected(grid, grid[:, 1] + d) for d in near]
-        shifts = [cylinder.wrap(views[:, 0] - shift.upper[:, 0] - grid[:, 0]) for views, shift in corrected]
+        shifts = [cylinder.wrap(views[:, 0] - shift.px[:, 3] - grid[:, 0]) for views, shift in corrected]
         slope = (shifts[1] - shifts[0]) / (near[1] - near[0])
         whole = len(columns) * grid_px, len(rows) * grid_px
         mode: Literal["wrap", "edge"] = "wrap" if cylinder.width == cylinder.period_px else "edge"

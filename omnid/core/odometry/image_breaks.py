@@ -121,7 +121,6 @@ class ImageBreaks:
         self,
         pair: tuple[PaddedPanorama, PaddedPanorama],
         estimate: OdometryEstimate,
-        exposure: Exposure,
         local_map: LocalMap,
         dt_s: float,
         costs: tuple[float, int] | None,
@@ -131,7 +130,8 @@ class ImageBreaks:
         costs: mean of the landmarks in view, and their number, None: no pose was found. A break costs at least as much
         as it must explain to be believed: where the views fit as usual there is none, and no flow is measured.
         """
-        last, found = self._last, None
+        last, found, exposure = self._last, None, estimate.exposure
+        assert exposure is not None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ estimate.T_odom_rect)
         self._last = now = _View(pair, estimate.T_odom_rect, exposure, step)
         is_broken = self._torn > DECIDING_COST or self._open is not None
@@ -176,7 +176,7 @@ class _Flow:
     """Flows of landmarks that are not explained by the step, in standard deviations, and what right images leave."""
 
     y: Array  # (N, 2)
-    null: Array  # (N, 2, 7) derivatives by the step's error, and by the lag of the upper camera
+    null: Array  # (N, 2, 6 + K) derivatives by the step's error, and by K errors of unit variance: lag and velocities
     shift: Array  # (N, 2, 3) by a shift and a turn of the raw image
     camera: Indices  # (N,)
     row: Array  # (N,) of the raw image, as a fraction of it
@@ -188,8 +188,9 @@ class _Flow:
         (N, 2); the squared distance from which on flows cost no more; and that which counts as 1 in a logarithm of
         likelihoods.
         """
-        starts = (np.zeros(self.null.shape[2]), _least_squares(self.null, self.y, np.ones(len(self.y))))
-        lefts = [self.y - self.null @ _robust(self.null, self.y, start) for start in starts]
+        size = self.null.shape[2]
+        starts = np.zeros(size), _least_squares(self.null, self.y, np.ones(len(self.y)), size)
+        lefts = [self.y - self.null @ _robust(self.null, self.y, start, size) for start in starts]
         squares = [(left**2).sum(axis=1) for left in lefts]
         # A step that is wrong must explain much more to be believed.
         costs = [np.minimum(each, 2 * OUTLIER_SQUARED * MOST_SCALE).sum() for each in squares]
@@ -222,8 +223,8 @@ def _flow(
     for camera, raw_image in enumerate(raws):
         # 1. Landmarks that both pairs show, tracked from where the step predicts them, else as if the rig had stood, as
         #    torn images show them. Their patches are aligned, bent as the step bends them.
-        own = [0, 1 + camera]
-        start, end = (at[:, own] - (shift.lower, shift.upper)[camera] for at, shift in zip(pixels, shifts, strict=True))
+        own, of_shift = ([0, 1], [0, 1]) if camera == 0 else ([0, 2], [3, 2])
+        start, end = (at[:, own] - shift.px[:, of_shift] for at, shift in zip(pixels, shifts, strict=True))
         raw, by_raw = raw_image.at(end)
         inside = np.isfinite(raw).all(axis=1)
         for at in (start, end):
@@ -250,15 +251,18 @@ def _flow(
         d[:, 0] = cylinder.wrap(d[:, 0])
         # 2. Derivatives, in standard deviations.
         noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], covariance[rows], of_point[rows][:, own])
-        noise += shifts[1].variance(now.exposure.motion)[rows][:, [0, 1] if camera == 0 else [3, 2]]
         px = np.sqrt(SIGMA_PX**2 + noise.mean(axis=1))
-        J, shift = of_step[rows][:, own] / px[:, None, None], by_raw[rows] / px[:, None, None]
+        J, of_raw = of_step[rows][:, own] / px[:, None, None], by_raw[rows] / px[:, None, None]
         size = np.array(raw_image.size)
         arm = raw[rows] - (size - 1) / 2
-        turn = shift @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]
-        null = np.concatenate([J, lag * camera * (J @ now.step)[:, :, None]], axis=2)
-        shift, of_camera = np.concatenate([shift, turn], axis=2), np.full(len(rows), camera)
-        parts.append((d / px[:, None], null, shift, of_camera, raw[rows, 1] / size[1], px))
+        turn = of_raw @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]
+        common = [lag * camera * (J @ now.step)[:, :, None]]
+        for shift in shifts:
+            by_motion = shift.by_motion[rows][:, of_shift] / px[:, None, None]
+            common.append(by_motion @ np.linalg.cholesky(shift.motion.covariance))
+        null = np.concatenate([J, *common], axis=2)
+        of_raw, of_camera = np.concatenate([of_raw, turn], axis=2), np.full(len(rows), camera)
+        parts.append((d / px[:, None], null, of_raw, of_camera, raw[rows, 1] / size[1], px))
     flow = _Flow(*(np.concatenate(part) for part in zip(*parts, strict=True)))
     return flow if len(flow.y) >= max(3 * LEAST, sought / 2) else None
 
@@ -299,13 +303,13 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
     starts = []
     if not is_torn:
         tried = np.concatenate([null, columns], axis=2)
-        starts.append(_robust(tried, y, _least_squares(tried, y, np.ones(len(y)))))
+        starts.append(_robust(tried, y, _least_squares(tried, y, np.ones(len(y)), unknowns), unknowns))
     parts = [np.flatnonzero(mask & is_off) for mask in masks]
     if min(map(len, parts)) >= LEAST:
         amounts = np.concatenate([_common(F[rows], whole_left[rows]) for rows in parts])
         starts.append(np.concatenate([np.zeros(unknowns), amounts]))
         if is_torn:  # the pose may have followed the part that is torn
-            starts.append(np.concatenate([amounts, [0.0], -amounts]))
+            starts.append(np.concatenate([amounts, np.zeros(unknowns - TORN), -amounts]))
     for start in starts:
         # 3. The likeliest line, of both sides; 0: the whole image.
         left = y - null @ start[:unknowns]
@@ -317,7 +321,7 @@ def _candidates(flow: _Flow, whole: tuple[Array, float, float], size: int, camer
             # 4. The amount and the step together, and the likelihood.
             beyond = (flow.row >= line) != side
             masked = np.concatenate([null, columns * beyond[:, None, None]], axis=2)
-            solution = _robust(masked, y, start)
+            solution = _robust(masked, y, start, unknowns)
             gain = float(gains(y - masked @ solution).sum()) - _cost(columns.shape[2], len(y))
             moved_px = np.linalg.norm(masked[:, :, unknowns:] @ solution[unknowns:], axis=1) * flow.px
             px = float(moved_px.sum() / max(1, np.count_nonzero(moved_px)))
@@ -354,16 +358,16 @@ def _common(A: Array, y: Array) -> Array:
     return _robust(A, y, np.median((np.linalg.pinv(A) @ y[:, :, None])[:, :, 0], axis=0))
 
 
-def _robust(A: Array, y: Array, x: Array) -> Array:
+def _robust(A: Array, y: Array, x: Array, known: int = 0) -> Array:
     """Return x (K,) that minimises the Geman-McClure cost of y - A x, A (N, 2, K), from a start."""
     for _ in range(GAUSS_NEWTON_STEPS):
-        x = _least_squares(A, y, 1.0 / (1.0 + ((y - A @ x) ** 2).sum(axis=1) / 4.0) ** 2)
+        x = _least_squares(A, y, 1.0 / (1.0 + ((y - A @ x) ** 2).sum(axis=1) / 4.0) ** 2, known)
     return x
 
 
-def _least_squares(A: Array, y: Array, weight: Array) -> Array:
-    """Return x (K,) that minimises the sum of weights (N,) times |y - A x|^2; the seventh, the lag, has a prior."""
+def _least_squares(A: Array, y: Array, weight: Array, known: int = 0) -> Array:
+    """Return x (K,) that minimises the sum of weights (N,) times |y - A x|^2; x[6:known] has unit variance."""
     size = A.shape[2]
     weighted, prior = (weight[:, None, None] * A).reshape(-1, size), np.full(size, DAMPING)
-    prior[6:7] = 1.0
+    prior[TORN:known] = 1.0
     return np.asarray(np.linalg.solve(weighted.T @ A.reshape(-1, size) + np.diag(prior), weighted.T @ y.ravel()))

@@ -72,7 +72,7 @@ def located(
     found[found] = ~_has_wrong_period(pair, points[found], rows[found], known, round(model.cylinder.focal_px))
     # 3. Correct the views for the motion during the exposures.
     views, shift = exposure.corrected(points[found], rows[found])
-    noise = view_noise(np.zeros((2, 2)), variance[found]) + shift.noise(exposure.motion)
+    noise = view_noise(np.zeros((2, 2)), variance[found]) + shift.noise
     return NewLandmarks(points[found], views, slopes[found], noise)
 
 

@@ -129,8 +129,7 @@ class VisualOdometry:
         estimate = self._pose(frame, max(dt_s, 0.0))
         if self.breaks is None:
             return estimate
-        pair, exposure = (frame.lower, frame.upper), self._exposure(frame)
-        self.breaks.add(pair, estimate, exposure, self._map, dt_s, self._cost)
+        self.breaks.add((frame.lower, frame.upper), estimate, self._map, dt_s, self._cost)
         if not self.breaks.fault and not self.breaks.covariance.any():
             return estimate
         is_torn = self.breaks.fault and estimate.state is TrackingState.TRACKING

@@ -118,15 +118,14 @@ class PoseSearch:
         shift = exposure.shift(in_guess)
         # 2. The rows in the upper panorama, where the patches must fit within REACH_PX of where the depths put them; a
         #    wrong one is an outlier of the pose.
-        guess = tracks.pixels + shift.lower - shift.upper
+        guess = tracks.pixels + shift.px[:, :2] - shift.px[:, [3, 2]]
         guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
-        spread_px = 2 * np.sqrt(shift.variance(exposure.motion)[:, 3])
         pair = frame.lower, frame.upper
-        rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, REACH_PX, spread_px)
-        views = np.column_stack([tracks.pixels, rows]) + np.column_stack([shift.lower, shift.upper[:, 1]])
+        rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, REACH_PX, shift.spread_px)
+        views = np.column_stack([tracks.pixels, rows]) + shift.px[:, :3]
         # 3. RANSAC on three points (IV.B) and Gauss-Newton on the bearings in both cameras (IV.C, in place of eq. 9).
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
-        chosen, noise = np.flatnonzero(is_inlier), shift.noise(exposure.motion)
+        chosen, noise = np.flatnonzero(is_inlier), shift.noise
         landmarks, coarse = tracks.landmarks[chosen], replace(self._model, sigma_px=COARSE_SIGMA_PX)
         solution, kept = self._solve(landmarks, views[chosen], T_curr_guess @ T_guess_odom, coarse, noise[chosen])
         if solution is None:
@@ -166,13 +165,13 @@ class PoseSearch:
         landmarks, predicted = self._map.visible(T_odom_curr)
         in_view = len(landmarks)
         shift = exposure.shift(se3.apply(T_curr_odom, self._map.table.points[landmarks]))
-        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, predicted[:, :2] - shift.lower)
+        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, predicted[:, :2] - shift.px[:, :2])
         found = aligned.found
         landmarks, pixels = landmarks[found], aligned.pixels[found]
         # 2. The views: aligned pixels, with the disparities of the tracks, corrected to the stamp of the pair.
         views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
         noise = view_noise(aligned.covariance[found], variance[landmarks])
-        views += np.column_stack([shift.lower, shift.upper[:, 1]])[found]
+        views += shift.px[found, :3]
         # 3. Solve for the pose and the velocity. The prior of the velocity is one measurement: unlike the landmarks'
         #    errors it is not correlated with others.
         by_motion = shift.by_motion[found, :3]

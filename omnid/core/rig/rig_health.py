@@ -169,7 +169,7 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
         # 4. Views at the stamp of the pair, where its images were exposed at several times.
         views, of_motion = exposure.corrected(below, above[:, 1])
         known = np.isfinite(views).all(axis=1)
-        columns = above[:, 0] + of_motion.upper[:, 0]
+        columns = above[:, 0] + of_motion.px[:, 3]
         below, above = views[known, :2], np.column_stack([columns, views[:, 2]])[known]
     return Matches(below, above, len(points), clear)
 

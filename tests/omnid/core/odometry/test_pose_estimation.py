@@ -132,15 +132,18 @@ def test_views_are_corrected_to_the_instant_of_the_stamp(times: PixelTimes) -> N
     lower, upper = seen(points, times, TWIST)
     exposure = Exposure(times, RigVelocity(TWIST, SIGMA**2), LARGE)
     shift = exposure.shift(points)
-    for raw, moved, expected in ((lower, shift.lower, truth[:, :2]), (upper, shift.upper, truth[:, [0, 2]])):
+    for raw, moved, expected in (
+        (lower, shift.px[:, :2], truth[:, :2]),
+        (upper, shift.px[:, [3, 2]], truth[:, [0, 2]]),
+    ):
         error = expected - raw - moved
         error[:, 0] = LARGE.cylinder.wrap(error[:, 0])
         assert np.abs(error).max() < 0.05  # the time is that of the nearest pixel
-    assert np.abs(np.r_[shift.lower, shift.upper]).max() > 1.0, "the motion matters"
+    assert np.abs(shift.px).max() > 1.0, "the motion matters"
     # Without the points: from the pixels and rows that are measured.
     views, found = exposure.corrected(lower, upper[:, 1])
     error = views - truth
     error[:, 0] = LARGE.cylinder.wrap(error[:, 0])
     assert np.abs(error).max() < 0.05
-    off_px = LARGE.cylinder.wrap(views[:, 0] - found.upper[:, 0] - upper[:, 0])
-    assert np.abs(off_px).max() < 0.05 and (found.variance(exposure.motion)[:, 3] > 0).all()
+    off_px = LARGE.cylinder.wrap(views[:, 0] - found.px[:, 3] - upper[:, 0])
+    assert np.abs(off_px).max() < 0.05 and (found.spread_px > 0).all()
