@@ -28,7 +28,6 @@ NOISE_CORRELATION = 3.0
 # the least share of that matrix that counts as texture.
 GRADIENT_NOISE, MIN_TRUE_GRADIENT = 0.12, 0.2
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
-LANES = 8  # columns that the compiler computes at once
 
 
 @compiled(
@@ -53,10 +52,8 @@ def sample(
     from the centres in the current panorama.
     """
     side, half = templates.shape[1], templates.shape[1] // 2
-    stride = 4 * side + 8  # what a template reaches, and the cubic kernel
-    cell = np.empty((stride, stride), np.float32)
-    greys, at, weights = cell.reshape(-1), np.empty(side, np.int32), np.empty((3, 4 * side), np.float32)
-    across, down, part = weights[0], weights[1], weights[2]
+    reach = 4 * side + 8  # of a template, and of the cubic kernel
+    cell, part = np.empty((reach, reach), np.float32), np.empty(4, np.float32)
     columns, rows = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(templates)):
         # A place that is NaN or outside has no template.
@@ -81,31 +78,17 @@ def sample(
             y1 = np.float32(rows[0, 1] + t * (rows[1, 1] + t * rows[2, 1]))
             y2 = np.float32(rows[0, 2] + t * (rows[1, 2] + t * rows[2, 2]))
             for j in range(side):
-                s = np.float32(np.int32(j) - np.int32(half))
+                s = np.float32(j - half)
                 x, y = x0 + s * (x1 + s * x2), y0 + s * (y1 + s * y2)
                 column, row = np.int32(x), np.int32(y)
-                at[j] = (row - np.int32(1)) * np.int32(stride) + column - np.int32(1)
-                a, b, c, d = keys(x - np.float32(column))
-                across[4 * j], across[4 * j + 1], across[4 * j + 2], across[4 * j + 3] = a, b, c, d
+                # 3. The grey there, by cubic convolution: bilinear interpolation shifts fine texture by up to 0.02 px.
+                above, here, below, last = cell[row - 1], cell[row], cell[row + 1], cell[row + 2]
                 a, b, c, d = keys(y - np.float32(row))
-                down[4 * j], down[4 * j + 1], down[4 * j + 2], down[4 * j + 3] = a, b, c, d
-            # 3. The greys there, by cubic convolution: bilinear interpolation shifts fine texture by up to 0.02 px.
-            for j in range(side):
-                k = 4 * j
-                first = np.uint64(at[j])
-                second, third, fourth = (
-                    first + np.uint64(stride),
-                    first + np.uint64(2 * stride),
-                    first + np.uint64(3 * stride),
-                )
-                a, b, c, d = down[k], down[k + 1], down[k + 2], down[k + 3]
+                k = column - 1
                 for m in range(4):
-                    column_sum = (
-                        a * greys[first + m] + b * greys[second + m] + c * greys[third + m] + d * greys[fourth + m]
-                    )
-                    part[k + m] = across[k + m] * column_sum
-            for j in range(side):
-                templates[n, i, j] = (part[4 * j] + part[4 * j + 1]) + (part[4 * j + 2] + part[4 * j + 3])
+                    part[m] = a * above[k + m] + b * here[k + m] + c * below[k + m] + d * last[k + m]
+                a, b, c, d = keys(x - np.float32(column))
+                templates[n, i, j] = (a * part[0] + b * part[1]) + (c * part[2] + d * part[3])
 
 
 @inner
@@ -215,9 +198,8 @@ def fit(
     """
     side, size = templates.shape[1] - 2, 5 if slope_sigma > 0 else 3
     pixels, noise = side * side, 2 * max(noise_grey, 1.0) ** 2
-    width = -(-side // LANES) * LANES  # of windows in memory; columns beyond the side are zero
-    design, ones = np.zeros((size, side, width), np.float32), np.ones((side, width), np.float32)
-    window, room = np.zeros((side, width), np.float32), np.empty(width, np.float32)
+    design, ones = np.empty((size, side, side), np.float32), np.ones((side, side), np.float32)
+    window, room = np.empty((side, side), np.float32), np.empty(side, np.float32)
     cell = np.empty((side + 2 * reach_px + 1, side + 2 * reach_px + 1), np.float32)
     normal, inverse, sums = np.empty((size, size)), np.empty((size, size)), np.empty(size)
     right, weighted, solution = np.empty(size), np.empty(size), np.empty(size)
@@ -275,7 +257,7 @@ def fit(
 
 @inner
 def write_design(template: Floats, design: Floats) -> None:
-    """Write the design (3 or 5, S, W) of a template (S + 2, S + 2): minus its derivatives, and the window itself.
+    """Write the design (3 or 5, S, S) of a template (S + 2, S + 2): minus its derivatives, and the window itself.
 
     The gradients along column and row are by Scharr's 3x3 operator; a slope moves a pixel by its column or row from
     the middle.
@@ -313,7 +295,7 @@ def copy_cell(image: Image, left: int, top: int, width: int, height: int, cell: 
 
 @inner
 def write_window(cell: Floats, x: float, y: float, window: Floats) -> None:
-    """Write the window (S, W) that begins between the pixels of a cell, by bilinear interpolation."""
+    """Write the window (S, S) that begins between the pixels of a cell, by bilinear interpolation."""
     left, top = math.floor(x), math.floor(y)
     u, v = np.float32(x - left), np.float32(y - top)
     p, q = np.float32(1) - u, np.float32(1) - v
@@ -325,7 +307,7 @@ def write_window(cell: Floats, x: float, y: float, window: Floats) -> None:
 
 @inner
 def dot(a: Floats, b: Floats, room: Floats) -> float:
-    """Return the sum of the products of two windows (S, W); by column (W,), which are added several at once."""
+    """Return the sum of the products of two windows (S, S); by column (S,), which are added several at once."""
     room[:] = 0.0
     for i in range(a.shape[0]):
         one, other = a[i], b[i]
