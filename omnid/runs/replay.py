@@ -186,7 +186,6 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         updates, newest_map = list[PlaceUpdate](), deque[MapUpdate](maxlen=1)
         rig = geometry.rig
         encoder = partial(Encoder, rig, config.obstacles.scan.max_range_m)
-        recorder: Recorder | None = None
         graph.sink("statistics", session.statistics, poses, thread=poses.thread)
         if options.collect:
             graph.sink("collect-poses", lambda pose: collected.append(kept(pose)), poses, thread=BACKGROUND)
@@ -208,11 +207,12 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
         if options.publish:
             bus = session.open_bus(rig, gives_time=True)
             streams.publish(graph, BusSink(bus, encoder(run_id=RUN_ID), gives_time=True))
+        observer = options.observer(front_end) if options.observer else None
         if options.record:
             attachments = {"rig.toml": rig_toml(rig).encode(), "omnid.toml": dump(config).encode()}
-            recorder = Recorder(SingleLog(options.record, attachments), config.bus.robot, log_time(), encoder())
-            closing.callback(recorder.close)
-        if observer := options.observer(front_end) if options.observer else recorder:
+            observer = Recorder(SingleLog(options.record, attachments), config.bus.robot, log_time(), encoder())
+            closing.callback(observer.close)
+        if observer is not None:
             graph.sink("record", observer, *(one.stream for one in streams.leaving))
         if options.progress is not None:
             show = partial(options.progress, session.statistics, reader.pair_estimate())

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from io import FileIO
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from omnid.formats.tum import tum_row
 from omnid.messages import OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
-REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
@@ -32,8 +31,6 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             wrong = "expected a file to write, found a folder"
         elif not path.parent.is_dir():
             wrong = f"there is no folder {path.parent}"
-        elif path.exists() and not path.is_file():  # Not opened, because that would end the reader of a pipe.
-            wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
         elif (other := used.setdefault(_identity(path), option)) != option:
             wrong = f"this is {other} as well"
         elif not os.access(path if path.exists() else path.parent, os.W_OK):
@@ -43,7 +40,9 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
 
 
 def _identity(path: Path) -> object:
-    """Return a key that is the same for all names of a file, hard and symbolic links included."""
+    """Return a key that is the same for all names of a file, links included; pipes and devices may be used twice."""
+    if path.exists() and not path.is_file():
+        return object()
     return (path.stat().st_dev, path.stat().st_ino) if path.exists() else path.resolve()
 
 

@@ -27,7 +27,7 @@ class SingleLog:
 
     def __init__(self, path: Path, attachments: Mapping[str, bytes]) -> None:
         """attachments: name -> content, written at the start of the file."""
-        self.state = RotatingLogState()
+        self.state = RotatingLogState()  # of a recording in several files, which this is not
         self._open = partial(LogWriter, path, dict(attachments))
         self._writer: LogWriter | None = None
 
@@ -35,8 +35,6 @@ class SingleLog:
         """Add a message, CDR with its encapsulation header."""
         self._writer = self._writer or self._open()
         self._writer.write(topic, schema_name, data, stamp_ns)
-        self.state.files = 1
-        self.state.messages += 1
 
     def end_file(self) -> None:
         """Do nothing: in a replay the clock has no steps, which would begin a new file."""

@@ -31,7 +31,6 @@ TABLE = (
     ("replay {log} --rig {folder}/absent.toml", "`omnid calibrate import` or"),
     ("calibrate import {rig} -o {folder}/x", "expected two cameras (cam0, cam1) as Kalibr writes them"),
     # Outputs.
-    ("replay {log} --rig {rig} --cloud /dev/null", "device"),
     ("replay {log} --tum {folder}/x --record {folder}/absent/x", "no folder"),
     ("replay {log} --tum {folder}/x --cloud {folder}/x", "--tum"),
     ("replay {log} --record {log}", "the log that is read"),
