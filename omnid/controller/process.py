@@ -45,9 +45,7 @@ def run_controller(channel: Channel) -> int:
             return 2
         # Memory, garbage collection and priority, for punctual ticks.
         prepare()
-        refused: list[str] = []
-        start_thread({THREAD_NAME: start.realtime.motor_priority}, lambda _, line: refused.append(line), THREAD_NAME)
-        channel.send(LogRecord(" ".join(refused)))
+        channel.send(LogRecord(start_thread(THREAD_NAME, start.realtime.motor_priority)))
         controller = Controller(
             driver,
             start.controller,

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import logging
 import os
 import resource
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType
@@ -54,18 +53,18 @@ def prepare() -> None:
         _LIBC.mlockall(1 | 2 | 4)  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT: else untouched stacks would take 400 MB
 
 
-def start_thread(priorities: Mapping[str, int], report: Callable[[int, str], object], name: str) -> None:
-    """Set name and priority of the calling thread, before its work.
+def start_thread(name: str, priority: int = 0) -> str:
+    """Set name and priority of the calling thread, before its work; return why it has no such priority, else "".
 
-    priorities: of SCHED_FIFO by name of the thread, 1 to 99; 0 or no entry for an ordinary thread. report: takes level
-    and text where the priority is refused; the thread then runs as an ordinary one.
+    priority: of SCHED_FIFO, 1 to 99; 0 for an ordinary thread, as which one runs whose priority is refused.
     """
     _LIBC.prctl(15, name.encode(), 0, 0, 0)  # PR_SET_NAME, of which `top -H` shows 15 bytes
-    if priority := priorities.get(name, 0):
+    if priority:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
         except OSError:
-            report(logging.WARNING, f"thread '{name}' cannot have real-time priority {priority}: {PRIORITY_ADVICE}")
+            return f"thread '{name}' cannot have real-time priority {priority}: {PRIORITY_ADVICE}"
+    return ""
 
 
 def highest_priority() -> int:

@@ -115,11 +115,12 @@ def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> None:
         was_asked = line == ARMED or names.DISARMED_BY_STOP in line
         log(logging.INFO if was_asked else logging.WARNING, line)
 
-    if robot.waits:  # Its time waits for the stages, so that nothing is dropped.
-        graph = Graph(on_thread=partial(start_thread, {}, log))
-    else:
-        priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
-        graph = Graph(drops=True, depth=1, on_thread=partial(start_thread, priorities, log))
+    def begin(thread: str) -> None:
+        if refused := start_thread(thread, config.realtime.capture_priority if thread in CAMERAS else 0):
+            warn(refused)
+
+    # Where the time of the robot waits for the stages nothing is dropped.
+    graph = Graph(on_thread=begin) if robot.waits else Graph(drops=True, depth=1, on_thread=begin)
     with ExitStack() as outputs:
         session = Session(config, graph, outputs, warn, RunStatistics(robot.clock))
         # 1. The rig, and what is compiled or imported before the first image.

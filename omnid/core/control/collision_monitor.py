@@ -271,6 +271,7 @@ class CollisionMonitor:
         self._ticks: deque[tuple[int, Twist, Pose2]] = deque()
         self.reason = ""  # why the last step changed the motion
         self.holds = False  # the motion was stopped, or could only creep
+        self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
         self._stopped_mps = 0.0  # motion that the last step stopped
 
     def set_scan(self, scan: ControllerScan) -> None:
@@ -308,7 +309,7 @@ class CollisionMonitor:
         creeps = share < 1.0 and share * speed_mps < min(2 * BESIDE_M / self._settings.time_s, speed_mps / 2)
         if creeps and self._stopped_mps * motion.velocity_mps > 0.0 and share > 0.0:
             share, reason = 0.0, self.reason
-        self.reason = reason
+        self.share, self.reason = share, reason
         self._stopped_mps = motion.velocity_mps if share == 0.0 else 0.0
         edge_mps = max(speed_mps, abs(motion.yaw_rate_radps) * self._outline.radius_m)
         self.holds = share * edge_mps < min(LEAST_MPS, edge_mps)
