@@ -85,25 +85,22 @@ class ConnectedRobot:
         self.clock = RobotClock()
 
     def connect(self, session: Session, _: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink | None]:
-        """Open the cameras, and start the controller process where there is a motor."""
-        graph, outputs = session.graph, session.outputs
+        """Open the cameras, and start the controller process where there is a motor; it waits for its answer.
+
+        The wheels stop, and the process ends, at the latest with the outputs of the session. Raises DriverError for
+        settings that it cannot use.
+        """
+        config, graph, outputs = session.config, session.graph, session.outputs
         cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
         self.states = {name: camera.state for name, camera in cameras.items()}
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
-        return frames, _start_controller(session) if session.config.motor.port else None
-
-
-def _start_controller(session: Session) -> ControllerLink:
-    """Start the controller process, which waits for the motor controller; DriverError for settings it cannot use.
-
-    The wheels stop, and the process ends, at the latest with the outputs of the session.
-    """
-    config = session.config
-    settings = config.controller if config.obstacles.enabled else config.controller.without_obstacles
-    start = ControllerStart(config.motor, settings, config.realtime)
-    link = ControllerLink(start, session.graph.counters("motor"), session.warn)
-    session.outputs.callback(link.close)
-    return link
+        if not config.motor.port:
+            return frames, None
+        settings = config.controller if config.obstacles.enabled else config.controller.without_obstacles
+        start = ControllerStart(config.motor, settings, config.realtime)
+        link = ControllerLink(start, graph.counters("motor"), session.warn)
+        outputs.callback(link.close)
+        return frames, link
 
 
 def run_live(config: Config, robot: LiveRobot, rig: Rig | None = None) -> None:
@@ -165,7 +162,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     subscribed = {topic for topic, setting in used.items() if setting != "off" and not robot.brings_samples}
     samples = graph.inlet(1, thread="bus commands")
     graph.sink("samples", motion.add, samples, thread=samples.thread)
-    navigation = None
+    requests = states = None
     if controller is not None and config.controller.collision.check and not config.obstacles.enabled:
         session.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from obstacles")
     if controller is not None:
@@ -174,9 +171,9 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
             subscribed.discard(topics.WHEEL_ODOM)
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
-        navigation = graph.inlet(topics.MAX_OPEN), states
+        requests = graph.inlet(topics.MAX_OPEN)
     saves = graph.inlet(topics.MAX_OPEN) if run_places.is_extended else None
-    inputs = Inputs(frames, run_places, controller, navigation, saves, config.live.cloud_s)
+    inputs = Inputs(frames, run_places, controller, requests, states, saves, config.live.cloud_s)
     streams = wire(config, inputs, front_end, graph)
     pairs, poses, reports = streams.pairs, streams.poses, graph.inlet(1)
     streams.leaving.append(Leaving("status", reports))
@@ -210,7 +207,6 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     # 4. Commands, requests and samples from the bus.
     freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))
     bus.serve(topics.TIME, freshness.own_time)
-    requests = None if navigation is None else navigation[0]
     commands = CommandReceiver(
         freshness, controller=controller, navigation=requests, saves=saves, samples=dict.fromkeys(subscribed, samples)
     )

@@ -126,8 +126,8 @@ class Inputs:
     frames: Sequence[Stream[Frame | MotionSample]] | Sequence[Stream[Frame]]
     map: RunPlaces  # of places, to begin with, and its file
     controller: DriveLink | None = None  # of a live run; its commands leave the run
-    # Requests to the navigation, and the states of the controller; None: the run does not navigate.
-    navigation: tuple[Stream[NavigationCommand], Stream[ControllerState]] | None = None
+    requests: Stream[NavigationCommand] | None = None  # None: the run does not navigate
+    states: Stream[ControllerState] | None = None  # of the controller, which the navigation needs
     saves: Stream[int] | None = None  # ids of requests to save the map; None: it is saved at the end only
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
@@ -206,8 +206,8 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph) -> S
         asked: list[Stream[PlaceUpdate | int]] = [in_map, inputs.saves]
         copies = graph.stage("map-copies", run_map.copy, *asked, thread=in_map.thread)
         answers.append(graph.sink("save", run_map.write, copies, thread=FILES, depth=MAX_OPEN))
-    if inputs.navigation is not None:
-        requests, states = inputs.navigation
+    requests, states = inputs.requests, inputs.states
+    if requests is not None and states is not None:
         files = RouteFiles(RouteFolder(Path(config.navigation.routes)), inputs.saves)
         of_base = config.controller.collision, T_base_rig, T_base_rect
         map_name = config.places.map if places else ""

@@ -186,7 +186,7 @@ def simulate(
 
     # 3. The run.
     run_places = RunPlaces(config, front_end.geometry, no_op)
-    inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=(requests, states))
+    inputs = Inputs([graph.source("cameras", messages)], run_places, requests=requests, states=states)
     streams = wire(config, inputs, front_end, graph)
     graph.sink("poses", take_pose, streams.poses)
     if streams.scans is not None:
