@@ -16,16 +16,13 @@ MAX_ENTRIES: Final = 64  # of parts in a status, and of values in a part
 def plain(text: str, max_length: int = MAX_CHARACTERS) -> str:
     """Return a text of printable characters, of which there are max_length at most."""
     shown = text[:max_length]
-    return shown if shown.isprintable() else "".join(map(_escaped, shown))[:max_length]
+    escaped = (one if one.isprintable() else one.encode("unicode_escape").decode("ascii") for one in shown)
+    return "".join(escaped)[:max_length]
 
 
 def one_line(message: object, max_length: int = MAX_CHARACTERS) -> str:
     """Return a message in one line of printable characters; white space of any length becomes one blank."""
     return plain(" ".join(str(message).split()), max_length)
-
-
-def _escaped(letter: str) -> str:
-    return letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
 
 
 def utc(stamp_ns: int) -> str:

@@ -260,19 +260,16 @@ class DriveProblem:
         squared = (residual**2).sum(axis=1) / scale**2
         root = np.sqrt(1 / (1 + squared / KERNEL_WIDTH**2))[:, None] / scale
         in_rig = self.in_rig(state, state.steps)
-        by_rig_point = self._by_point(state.steps, in_rig) * root[:, :, None]
+        # 1. By the points in the rig frame (M, 2, 3), by differences of a part of their distance.
+        rig, reach = self.parameters.at(state.steps), BEST_STEP * np.linalg.norm(in_rig, axis=1, keepdims=True)
+        J = central_differences(lambda by: project(rig, seen.camera, in_rig + reach * by), np.ones(3))
+        by_rig_point = np.nan_to_num(J / reach[:, :, None]) * root[:, :, None]
+        # 2. By the unknowns.
         by_pose = np.concatenate([by_rig_point, -by_rig_point @ se3.hat(in_rig)], axis=2)
         by_steps = (self._by_steps(state) * root[:, :, None]).reshape(residual.size, len(self.prior))
         J_poses = _scattered(by_pose, seen.keyframe, len(state.T_rig_odom))
         of_landmarks = by_rig_point @ se3.R_of(state.T_rig_odom[seen.keyframe])
         return (residual * root).ravel(), J_poses[:, 6:], by_steps, of_landmarks
-
-    def _by_point(self, steps: Array, points: Array) -> Array:
-        """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""
-        rig, camera = self.parameters.at(steps), self.observations.camera
-        reach = BEST_STEP * np.linalg.norm(points, axis=1, keepdims=True)
-        J = central_differences(lambda by: project(rig, camera, points + reach * by), np.ones(3))
-        return np.asarray(np.nan_to_num(J / reach[:, :, None]))
 
     def _by_steps(self, state: DriveState) -> Array:
         """Return the derivative (M, 2, P) of the pixels by the rig's steps."""

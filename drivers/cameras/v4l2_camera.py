@@ -54,7 +54,9 @@ class V4l2Camera:
         self._reading = True
         reopening = Backoff()
         try:
-            self._discard()
+            with suppress(OSError):  # a lost device raises again at the next read
+                while not self._closing.is_set() and self._streams and self._streams[0].dequeue():
+                    pass
             while not self._closing.is_set():
                 delivered = self.state.frames
                 try:
@@ -132,12 +134,6 @@ class V4l2Camera:
         if self.state.exposure is not None:
             self.state.exposure.problem, self.state.exposure.done = "", None
         return stream
-
-    def _discard(self) -> None:
-        """Return the buffers that were filled before the first read."""
-        with suppress(OSError):  # a lost device raises again at the next read
-            while not self._closing.is_set() and self._streams and self._streams[0].dequeue():
-                pass
 
     def _release(self) -> None:
         with suppress(IndexError):

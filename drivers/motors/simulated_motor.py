@@ -67,18 +67,7 @@ class SimulatedBase:
         self.velocity_mps += self._step_to(velocity_mps - self.velocity_mps, limits.acceleration_mps2, dt_s)
         wanted_radps = _clamp(yaw_rate_radps, limits.yaw_rate_radps)
         self.yaw_rate_radps += self._step_to(wanted_radps - self.yaw_rate_radps, limits.yaw_acceleration_radps2, dt_s)
-        # 3. The pose.
-        self._move(dt_s)
-
-    def _step_to(self, difference: float, acceleration: float, dt_s: float) -> float:
-        """Return the change of a speed towards a commanded one, with lag and limited acceleration."""
-        lag_s = self.limits.lag_s
-        if lag_s and abs(difference) > REACHED:
-            difference *= 1.0 - math.exp(-dt_s / lag_s)
-        return _clamp(difference, acceleration * dt_s)
-
-    def _move(self, dt_s: float) -> None:
-        """Move the pose along the chord of the arc that the wheels travel over the ground."""
+        # 3. The pose, along the chord of the arc that the wheels travel over the ground.
         x_m, y_m, heading_rad = self.pose
         half_m = self.yaw_rate_radps * dt_s * self.drive.track_m / 2
         rims_m = self.velocity_mps * dt_s - half_m, self.velocity_mps * dt_s + half_m
@@ -86,6 +75,13 @@ class SimulatedBase:
         chord_rad = heading_rad + rotation_rad / 2
         x_m, y_m = x_m + distance_m * math.cos(chord_rad), y_m + distance_m * math.sin(chord_rad)
         self.pose = (x_m, y_m, math.remainder(heading_rad + rotation_rad, math.tau))
+
+    def _step_to(self, difference: float, acceleration: float, dt_s: float) -> float:
+        """Return the change of a speed towards a commanded one, with lag and limited acceleration."""
+        lag_s = self.limits.lag_s
+        if lag_s and abs(difference) > REACHED:
+            difference *= 1.0 - math.exp(-dt_s / lag_s)
+        return _clamp(difference, acceleration * dt_s)
 
     def _twist(self, left_mps: float, right_mps: float) -> tuple[float, float]:
         return (left_mps + right_mps) / 2, (right_mps - left_mps) / self.drive.track_m

@@ -93,8 +93,13 @@ def calibrate_drive(
     # 4. Refuse what is another rig.
     require_same_rig(parameters, steps)
     # 5. The length of the baseline by the prior, and the covariance.
-    first_sigma_px = observation_sigma(before, found)
-    return DriveCalibration(_finished_rig(before, found), found, first_sigma_px)
+    names, units = parameters.rig_names, parameters.units[: len(parameters.rig_names)]
+    change = steps[: len(names)] * units
+    covariance = found.covariance[: len(names), : len(names)] * np.outer(units, units)
+    baseline_m, matrix = parameters.baseline(change, covariance)
+    rig = found.rig.with_upper_moved(np.zeros(3), np.zeros(2), baseline_m - before.baseline_m)
+    rig = replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))
+    return DriveCalibration(rig, found, observation_sigma(before, found))
 
 
 def straightened(log: Path, parameters: RigParameters, cameras: LogCameras, progress: LineReporter) -> Array:
@@ -110,17 +115,6 @@ def straightened(log: Path, parameters: RigParameters, cameras: LogCameras, prog
     # Errors of a centre, and the motion between two exposures, have the effect of a shifted viewpoint, so only the
     # rotation is a start.
     return parameters.turned(finding.drift.turn)
-
-
-def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:
-    """Return the rig with the length of its baseline and its covariance."""
-    parameters = found.parameters
-    names, units = parameters.rig_names, parameters.units[: len(parameters.rig_names)]
-    change = found.state.steps[: len(names)] * units
-    covariance = found.covariance[: len(names), : len(names)] * np.outer(units, units)
-    baseline_m, matrix = parameters.baseline(change, covariance)
-    rig = found.rig.with_upper_moved(np.zeros(3), np.zeros(2), baseline_m - before.baseline_m)
-    return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))
 
 
 def require_same_rig(parameters: RigParameters, steps: Array) -> None:

@@ -107,8 +107,14 @@ def calibrate_rig(
     sizes = [next(iter(side.values())).shape[::-1] for side in images.sides]
     found = calibrate_boards(views, board, [(w, h) for w, h in sizes], view or "mirror", images.sides, progress)
     # 5. Compare the baseline with what it can be.
-    if expected_baseline_m is not None:
-        _check_baseline(found, board, expected_baseline_m)
+    if expected_baseline_m is not None and abs(found.baseline_m / expected_baseline_m - 1) > REFUSED_PART:
+        length_mm = 1e3 * board.square_m
+        raise OmnidError(
+            f"calibrate rig: expected a baseline of {1e3 * expected_baseline_m:g} mm, found "
+            f"{1e3 * found.baseline_m:.1f} mm; squares or tags of "
+            f"{length_mm * expected_baseline_m / found.baseline_m:.2f} mm would explain it: measure the "
+            f"board ({length_mm:g} mm are given) and the distance of the mirrors"
+        )
     # 6. Build the rig with masks and covariance.
     rig, unmasked = _masked_rig(found, images)
     rig = replace(rig, covariance=rig_covariance(found, rig))
@@ -126,17 +132,6 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: LineReporter) -
             raise OmnidError(f"{name} camera: {error}") from error
     seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names]
     return [view for view in seen if view.is_seen]
-
-
-def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float) -> None:
-    """Raise OmnidError if the baseline is far from the expected one."""
-    if abs(found.baseline_m / expected_m - 1) > REFUSED_PART:
-        length_mm = 1e3 * board.square_m
-        raise OmnidError(
-            f"calibrate rig: expected a baseline of {1e3 * expected_m:g} mm, found {1e3 * found.baseline_m:.1f} mm; "
-            f"squares or tags of {length_mm * expected_m / found.baseline_m:.2f} mm would explain it: measure the "
-            f"board ({length_mm:g} mm are given) and the distance of the mirrors"
-        )
 
 
 def _masked_rig(found: RigCalibration, images: PairedImages) -> tuple[Rig, list[str]]:

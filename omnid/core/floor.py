@@ -90,12 +90,17 @@ def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
 
     variance_m2 (N,): along the rays.
     """
-    # 1. The points far enough below the horizon, and their noise along z.
-    xyz, sigma_m = _usable(points, variance_m2)
+    # 1. The points far enough below the horizon whose noise along z is small enough, at most MAX_POINTS.
+    across, fall = np.hypot(points[:, 0], points[:, 1]), -points[:, 2]
+    steep = (fall > HEIGHTS_M[0]) & (fall > STEEP * across)
+    xyz, fall, across = points[steep], fall[steep], across[steep]
+    sigma_m = np.hypot(np.sqrt(variance_m2[steep]) * fall / np.hypot(across, fall), UNEVEN_M)
+    kept = np.flatnonzero(sigma_m < LARGEST_SIGMA_M)  # False for NaN
+    kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
+    xyz, sigma_m, across = xyz[kept], sigma_m[kept], across[kept]
     if len(xyz) < SECTORS:
         return None
     # 2. The likeliest height of a level floor; its tilt is noise that grows with the range.
-    across = np.hypot(xyz[:, 0], xyz[:, 1])
     heights_m = HEIGHTS_M[:, None]
     on, off = _densities(xyz[:, 2] + heights_m, np.hypot(sigma_m, TILT_SIGMA_RAD * across), heights_m)
     best = np.log(FIRST_PART * on + (1 - FIRST_PART) * off).sum(axis=1).argmax()
@@ -152,14 +157,3 @@ def common_floor(pairs: Iterable[tuple[Array, Array]]) -> Floor | None:
         return None
     height_m, a, b, sigma_m, sigma_rad = middle.tolist()
     return Floor(height_m, a, b, math.hypot(sigma_m, scatter[0]), math.hypot(sigma_rad, scatter[1:3].max()))
-
-
-def _usable(points: Array, variance_m2: Array) -> tuple[Array, Array]:
-    """Return the points (N, 3) below the horizon, at most MAX_POINTS, and their noise along z (N,), which is small."""
-    across, fall = np.hypot(points[:, 0], points[:, 1]), -points[:, 2]
-    steep = (fall > HEIGHTS_M[0]) & (fall > STEEP * across)
-    xyz, fall, across = points[steep], fall[steep], across[steep]
-    sigma = np.hypot(np.sqrt(variance_m2[steep]) * fall / np.hypot(across, fall), UNEVEN_M)
-    kept = np.flatnonzero(sigma < LARGEST_SIGMA_M)  # False for NaN
-    kept = kept[:: max(1, -(-len(kept) // MAX_POINTS))]
-    return xyz[kept], sigma[kept]

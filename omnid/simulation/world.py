@@ -300,7 +300,7 @@ def _painted_world(world: WorldTable, name: str, seed: int) -> World:
         surfaces += _wall(rng, wall, wall.height_m or space.ceiling_m)
     for entry in world.box:
         surfaces += _box(rng, entry)
-    people = tuple(_person(rng, walker) for walker in world.person)
+    people = tuple(Person(tuple(_box(rng, Box((0.0, 0.0), walker.size_m))), walker) for walker in world.person)
     return World(name, tuple(surfaces), people, (x_m, y_m, math.radians(heading_deg)), world.light)
 
 
@@ -348,7 +348,3 @@ def _box(rng: Random, entry: Box) -> list[Rectangle]:
     at, yaw_rad = (*entry.at, entry.bottom_m), math.radians(entry.yaw_deg)
     chosen = surfaces.poster_paint(rng) if entry.texture == "poster" else paint
     return surfaces.solid(at, entry.size_m, yaw_rad, chosen, is_raised=entry.bottom_m > 0)
-
-
-def _person(rng: Random, walk: Walker) -> Person:
-    return Person(tuple(_box(rng, Box((0.0, 0.0), walk.size_m))), walk)

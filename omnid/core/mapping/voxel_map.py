@@ -71,8 +71,11 @@ class VoxelMap:
         self._voxels[at[is_known]] = known
         # 3. New ones.
         self._voxels = np.insert(self._voxels, at[~is_known], seen[~is_known])
+        # 4. Half of too many are dropped: the least confident ones, of equal ones those seen last long ago.
         if len(self) > self._max_voxels:
-            self._evict()
+            order = np.lexsort((self._voxels["last_seq"], self._confidence()))
+            dropped = len(order) - self._max_voxels // 2
+            self._voxels = self._voxels[np.sort(order[dropped:])]
 
     def points(self, min_frames: int = 2) -> MapPoints:
         """Return the voxels seen in at least `min_frames` frames, with their mean positions, sorted by key."""
@@ -89,12 +92,6 @@ class VoxelMap:
         """Return confidences 0..1: n / (n + 1) for n frames times 1 / (1 + variance of the mean / voxel^2)."""
         frames, weight = self._voxels["frames"].astype(np.float64), self._voxels["sums"][:, 0]
         return np.asarray(frames / (frames + 1.0) * weight / (weight + self._voxel_m**-2))
-
-    def _evict(self) -> None:
-        """Drop half of the voxels: the least confident ones, of equal ones those seen last long ago."""
-        order = np.lexsort((self._voxels["last_seq"], self._confidence()))
-        dropped = len(order) - self._max_voxels // 2
-        self._voxels = self._voxels[np.sort(order[dropped:])]
 
 
 class ThinnedPath:

@@ -22,10 +22,10 @@ from omnid.simulation.world import load_world
 from omnid.stages.geometry import Dewarp, Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from tests.bench.drive import lap
-from tests.simulation import paths
+from tests.simulation import paths, recipes
 from tests.simulation.builders import corridor
 from tests.simulation.builders import wall as upright
-from tests.simulation.recipes import TURN_DEG, SimulatedRun
+from tests.simulation.recipes import SimulatedRun
 from tests.simulation.rigs import make_rig
 
 DESCRIPTION = "experiment.json"  # in the folder of a log
@@ -64,8 +64,7 @@ def facing(seed: int, size: int, pairs: int) -> SimulatedRun:
 
 def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return 5 cm steps along a spline between two walls, with a turn of 94 degrees just before the end (V.C)."""
-    poses = paths.spline_path(seed, pairs, 0.05, turn=(max(1, pairs - 2), TURN_DEG))
-    return SimulatedRun(seeded_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
+    return replace(recipes.two_walls(seed, size, pairs), rig=seeded_rig(seed, size))
 
 
 def turns(seed: int, size: int, pairs: int) -> SimulatedRun:
