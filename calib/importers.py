@@ -104,7 +104,7 @@ def parse_chain(
         low, up = _lower_and_upper(chain, (lower, upper), poses, warn_of_file, has_rig_frame=has_rig_frame)
         if not {low, up} <= poses.keys():
             raise CalibError(f"no transform between {low} and {up}; expected T_cam_imu of both, or T_cn_cnm1")
-        # 2. Their models. Nothing in the file tells lenses from mirrors whose images were flipped.
+        # 2. Their models. The file does not distinguish lenses from mirrors whose images were flipped.
         models = []
         for key in (low, up):
             with within(f"{key}: "):

@@ -28,12 +28,12 @@ def find_grids(image: Grey, corners: CornerCandidates) -> list[Grid]:
     neighbour, back = link_neighbours(image, corners)
     squares = _in_square(neighbour, back)
     neighbour = np.where(squares, neighbour, NO_NEIGHBOUR)
-    taken = np.zeros(len(corners), bool)
+    used = np.zeros(len(corners), bool)
     grids = []
     for seed in np.argsort(-(neighbour != NO_NEIGHBOUR).sum(axis=1), kind="stable"):
-        if not taken[seed] and (neighbour[seed] != NO_NEIGHBOUR).any():
+        if not used[seed] and (neighbour[seed] != NO_NEIGHBOUR).any():
             cells = _flood_fill(int(seed), neighbour, back)
-            taken[list(cells.values())] = True
+            used[list(cells.values())] = True
             grids.append({cell: corners.pixels[index] for cell, index in cells.items()})
     return sorted((grid for grid in grids if len(grid) >= 4), key=len, reverse=True)
 

@@ -102,30 +102,23 @@ def minimise(
         # 1. Linearise at the state, with the scale of its residuals.
         scale = problem.scale(state)
         cost, system = problem.cost(state, scale), problem.normal_equations(state, scale)
-        # 2. Raise the damping until a step lowers the cost.
-        trial, trial_cost = _trial(problem, state, system, scale, damping)
-        while not trial_cost < cost:
+        # 2. Raise the damping until a step leads to a camera, and lowers the cost.
+        while True:
+            try:
+                trial = problem.moved(state, *system.step(damping))
+            except np.linalg.LinAlgError:
+                trial = None
+            if trial is not None and (trial_cost := problem.cost(trial, scale)) < cost:
+                break
             damping *= DAMPING_FACTOR
             if damping > MAX_DAMPING:
                 return state
-            trial, trial_cost = _trial(problem, state, system, scale, damping)
         # 3. Take the step. End if it gained little, else lower the damping.
         state = trial
         if cost - trial_cost < gain * cost and damping < last_damping:
             return state
         damping = max(MIN_DAMPING, damping / DAMPING_FACTOR)
     return state
-
-
-def _trial(
-    problem: Problem[State], state: State, system: ArrowSystem, scale: float, damping: float
-) -> tuple[State, float]:
-    """Return the state after a step, and its cost; infinite if the step leads to no camera."""
-    try:
-        moved = problem.moved(state, *system.step(damping))
-    except np.linalg.LinAlgError:
-        moved = None
-    return (state, np.inf) if moved is None else (moved, problem.cost(moved, scale))
 
 
 def central_differences(function: Callable[[Array], Array], steps: Array) -> Array:

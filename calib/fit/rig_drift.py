@@ -63,7 +63,7 @@ def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift:
         residual, about = _residuals(x, lower, upper), x
         J = central_differences(
             lambda step, about=about: _residuals(about + step, lower, upper),  # type: ignore[misc]
-            BEST_STEP * np.ones(5),
+            BEST_STEP * np.ones(len(x)),
         )
         sigma = robust_sigma(residual - np.median(residual))
         weight = 1 / (1 + (residual / (KERNEL_WIDTH * sigma)) ** 2) ** 2

@@ -260,7 +260,7 @@ class DriveProblem:
         squared = (residual**2).sum(axis=1) / scale**2
         root = np.sqrt(1 / (1 + squared / KERNEL_WIDTH**2))[:, None] / scale
         in_rig = self.in_rig(state, state.steps)
-        # 1. By the points in the rig frame (M, 2, 3), by differences of a part of their distance.
+        # 1. By the points in the rig frame (M, 2, 3); steps are a fraction of their distance.
         rig, reach = self.parameters.at(state.steps), BEST_STEP * np.linalg.norm(in_rig, axis=1, keepdims=True)
         J = central_differences(lambda by: project(rig, seen.camera, in_rig + reach * by), np.ones(3))
         by_rig_point = np.nan_to_num(J / reach[:, :, None]) * root[:, :, None]

@@ -47,7 +47,7 @@ class RigResult:
         # Errors of drives by the covariance: None if the cameras see too little in common.
         found, drives = self.calibration, drive_uncertainty(self.rig)
         rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(found.T_upper_lower))))
-        sigma_deg = np.rad2deg(np.sqrt(np.trace(found.motion_covariance[3:, 3:])))
+        sigma_deg = np.rad2deg(np.sqrt(np.diag(found.motion_covariance)[3:].sum()))
         single_views = len(found.views) - found.pairs
         return (
             f"baseline {found.baseline_m * 1e3:.2f} mm (sigma "

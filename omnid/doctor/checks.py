@@ -154,5 +154,5 @@ def bus(config: BusConfig) -> Finding:
             "name a file with users in bus.config (omnid/transport/site.json5), or listen on tcp/127.0.0.1:7447 only"
         )
         return Finding("warning", "bus", f"anyone who reaches {endpoints} can drive the robot", advice)
-    allowed = f"reachable at {endpoints}; who may command it is said in {config.config}"
+    allowed = f"reachable at {endpoints}; who may command it is set by {config.config}"
     return Finding("ok", "bus", allowed if endpoints else "reachable from this machine only")

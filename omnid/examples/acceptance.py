@@ -91,6 +91,6 @@ def main(arguments: list[str]) -> int:
 if __name__ == "__main__":
     try:
         sys.exit(main(sys.argv[1:]))
-    except (CalibError, OmnidError, ValueError) as error:  # of files, rigs and numbers: 1 is a verdict, 2 an error
+    except (CalibError, OmnidError, ValueError) as error:  # of files, rigs and numbers: 1 is a result, 2 an error
         print(f"acceptance: {error}", file=sys.stderr)
         sys.exit(2)

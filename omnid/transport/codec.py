@@ -447,7 +447,7 @@ class TwistRecord(NamedTuple):
     frame: str
     velocity_mps: float
     yaw_rate_radps: float
-    aside: Mapping[str, float]  # what no base with two driven sides has, by name, such as "linear.y"
+    unsupported: Mapping[str, float]  # what no base with two driven sides has, by name, such as "linear.y"
 
 
 class PlanarPath(NamedTuple):
@@ -473,8 +473,8 @@ def twist_from_cdr(payload: bytes) -> TwistRecord:
         message = decoded(payload, TWIST_SCHEMA)
         stamp_ns, frame, twist = stamp_of(message.header), message.header.frame_id, message.twist
     linear, angular = twist.linear, twist.angular
-    aside = {"linear.y": linear.y, "linear.z": linear.z, "angular.x": angular.x, "angular.y": angular.y}
-    return TwistRecord(stamp_ns, frame, linear.x, angular.z, aside)
+    unsupported = {"linear.y": linear.y, "linear.z": linear.z, "angular.x": angular.x, "angular.y": angular.y}
+    return TwistRecord(stamp_ns, frame, linear.x, angular.z, unsupported)
 
 
 def header_cdr(stamp_ns: int) -> bytes:

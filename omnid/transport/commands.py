@@ -267,9 +267,9 @@ def _save(saves: Stream[int], request: Request, _: int) -> None:
 
 def _twist_command(payload: bytes) -> tuple[int, Setpoint]:
     """Return the stamp [ns], 0 without one, of a speed and a yaw rate. Raise OmnidError for anything else."""
-    stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = codec.twist_from_cdr(payload)
+    stamp_ns, frame, velocity_mps, yaw_rate_radps, unsupported = codec.twist_from_cdr(payload)
     _check(frame, "base_link", velocity_mps, yaw_rate_radps)
-    for name, speed in aside.items():
+    for name, speed in unsupported.items():
         if not abs(speed) <= MIN_SPEED:
             found = f"twist.{name} = {speed:g}; send linear.x and angular.z only"
             raise Refused("not possible with a differential drive", found)

@@ -119,7 +119,7 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
             "nor '-', and a letter first"
         )
     result, untouched = _of_file(config), zenoh.Config()
-    # 1. Who connects where is said in [bus].
+    # 1. Who connects where is set by [bus].
     endpoints: dict[str, Any] = {
         "mode": "client" if config.is_client else "peer",
         "listen/endpoints": list(config.listen),

@@ -97,7 +97,7 @@ class Hypothesis:
         return np.asarray(poses[self.place.id] @ self.place.T_place_rect @ se3.inverse(self.T_odom_rect))
 
 
-def agreeing(kept: Iterable[Hypothesis], new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
+def consistent_hypotheses(kept: Iterable[Hypothesis], new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
     """Return the recognitions that agree with a new one, which is the last of them; none if there are too few.
 
     Both must place the newer frame at the same pose in the map. Frames at one place count as one, unless they show
@@ -323,7 +323,7 @@ class MapLocaliser:
         link = Link(found.id, -1, found.T_place_rect, found.covariance, found.inliers)
         link = link.then(Link(newest.id, -1, T_keyframe_rect, since).reversed())
         hypothesis, poses = Hypothesis(found, frame.T_odom_rect, link), self.places.poses
-        consistent = agreeing(self._hypotheses, hypothesis, poses)
+        consistent = consistent_hypotheses(self._hypotheses, hypothesis, poses)
         self._hypotheses.append(hypothesis)
         if not consistent:
             return

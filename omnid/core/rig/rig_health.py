@@ -48,7 +48,7 @@ COARSE: Final = 4
 PATCH_PX: Final = COARSE
 # Search range to either side and downwards, in the reduced image at scale 1: five degrees of 1300 columns, because a
 # rig that is wrong by more finds chance matches only; and a point at one and a half baselines.
-ASIDE_PX, DOWN_PX = 5, 30
+ACROSS_PX, DOWN_PX = 5, 30
 # Least correlation of a coarse match, because the search is wide, and a lower one lets more chance matches pass.
 MIN_CORRELATION: Final = 0.8
 # Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than the coarse search errs.
@@ -146,14 +146,14 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
     # 1. Corners of the lower panorama, and the best place of each in the upper one, both reduced.
     points = corners(lower, visible, POINTS)
     small_lower, small_upper = (block_means(padded.image, COARSE) for padded in (lower, upper))
-    aside, down_most = at_scale(ASIDE_PX, lower.scale), at_scale(DOWN_PX, lower.scale)
+    across, down_most = at_scale(ACROSS_PX, lower.scale), at_scale(DOWN_PX, lower.scale)
     guess, good, clear = points.copy(), np.zeros(len(points), bool), 0
     reduced = ((points + np.array([lower.pad_px, 0])) / COARSE).round().astype(int)
     for index, (left, top) in enumerate((reduced - PATCH_PX).tolist()):
-        right, bottom, low = left + 2 * PATCH_PX + 1, top + 2 * PATCH_PX + 1, max(0, left - aside)
+        right, bottom, low = left + 2 * PATCH_PX + 1, top + 2 * PATCH_PX + 1, max(0, left - across)
         if left < 0 or top < 0 or right > small_lower.shape[1] or bottom > small_lower.shape[0]:
             continue
-        patch, strip = small_lower[top:bottom, left:right], small_upper[top : bottom + down_most, low : right + aside]
+        patch, strip = small_lower[top:bottom, left:right], small_upper[top : bottom + down_most, low : right + across]
         _, best, _, (shift, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
         guess[index] += COARSE * (low + shift - left), COARSE * down
         good[index] = best >= MIN_CORRELATION
@@ -185,7 +185,7 @@ def judge(found: Sequence[Matches], cylinder: Cylinder, exchanged: int = 0) -> R
         # 1. The rotation and shift of the upper camera that explain the columns; the rotation, or a part of the shift,
         #    less SIGMAS standard deviations counts.
         drift = estimate_rig_drift(cylinder.rays(lower), cylinder.rays(upper))
-        angles = (drift.turn, drift.sigmas[:3]), (drift.shift, drift.sigmas[3:])
+        angles = zip((drift.turn, drift.shift), np.split(drift.sigmas, [len(drift.turn)]), strict=True)
         turn, shift = (float(np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma)) for angle, sigma in angles)
         misfit_deg = math.degrees(max(turn, SHIFT_WEIGHT * shift, 0.0))
         # 2. Residuals in each direction, which no rotation of a camera explains, show changed intrinsics.
