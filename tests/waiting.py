@@ -1,11 +1,17 @@
-"""Waiting on a loaded machine, for what threads and processes do."""
+"""Processes of tests, and waiting on a loaded machine for what they and threads do."""
 
 from __future__ import annotations
 
+import os
 import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
+ROOT = Path(__file__).parents[1]
+OMNID = (sys.executable, "-m", "omnid")
 PATIENCE_S = 60.0  # timeout of a wait; not a measured time
 
 
@@ -17,6 +23,19 @@ def wait_until(
     while not happens():
         assert time.monotonic() < deadline_s, f"{what} did not happen within {patience_s:g} s"
         time.sleep(pause_s)
+
+
+@contextmanager
+def running(
+    command: Sequence[object], environment: Mapping[str, str] | None = None, *, stdin: int | None = None
+) -> Iterator[subprocess.Popen[str]]:
+    """Yield a process of this source tree, whose output is piped; it is killed at the end of the block."""
+    words, pipe, its = [*map(str, command)], subprocess.PIPE, {"PYTHONPATH": str(ROOT), **(environment or {})}
+    with subprocess.Popen(words, stdin=stdin, stdout=pipe, stderr=pipe, text=True, env=os.environ | its) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def ended(process: subprocess.Popen[str], number: int) -> tuple[int, str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from mcap.reader import make_reader
 
 from omnid.cli import main
 
@@ -47,6 +48,18 @@ class Command:
         code, out, err = self(*words)
         assert code == 2 and out == "" and err.count("\n") == 1 and err.startswith("omnid: "), (code, out, err)
         return err
+
+
+def recorded(log: Path, topic: str) -> list[bytes]:
+    """Return the messages of a topic of a recording."""
+    with log.open("rb") as file:
+        return [message.data for _, _, message in make_reader(file).iter_messages([topic])]
+
+
+def attached(log: Path) -> dict[str, bytes]:
+    """Return the files attached to a recording by their names."""
+    with log.open("rb") as file:
+        return {attachment.name: attachment.data for attachment in make_reader(file).iter_attachments()}
 
 
 def rows(tum: Path) -> Sequence[str]:

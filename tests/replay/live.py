@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
 import subprocess
@@ -22,9 +21,8 @@ from omnid.transport import codec
 from omnid.transport.codec import Pose
 from tests.contract.simulated_controllers import PtyMotor, SimulatedLine
 from tests.ports import free_port
-from tests.waiting import ended, wait_until
+from tests.waiting import ended, running, wait_until
 
-ROOT = Path(__file__).parents[2]
 COMMAND_PERIOD_S = 0.05  # of the operator's commands
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -233,13 +231,8 @@ def patient(*settings: str) -> tuple[str, ...]:
 @contextmanager
 def started(command: list[str], port: int) -> Iterator[Daemon]:
     """Yield a daemon that is killed at the end of the block."""
-    pipe = subprocess.PIPE
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
-        try:
-            yield Daemon(process, port)
-        finally:
-            process.kill()
+    with running(command, stdin=subprocess.PIPE) as process:
+        yield Daemon(process, port)
 
 
 @contextmanager

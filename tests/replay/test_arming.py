@@ -7,7 +7,6 @@ import pty
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -22,8 +21,8 @@ from omnid.core.control.safety_rules import COMMAND_STALE, FAILED
 from omnid.transport.status_names import STOPPED_PREFIX
 from tests.ports import free_port
 from tests.replay.command import Command
-from tests.replay.live import ROOT, Base, Daemon, Operator, patient, robot
-from tests.waiting import PATIENCE_S, wait_until
+from tests.replay.live import Base, Daemon, Operator, patient, robot
+from tests.waiting import OMNID, PATIENCE_S, ROOT, running, wait_until
 
 # At half the speed of the log: the tests look at what is commanded.
 MANUAL = (
@@ -110,7 +109,7 @@ UP = b"\x1b[A"
 def keyboard(port: int) -> Iterator[tuple[int, subprocess.Popen[bytes]]]:
     """Yield the keyboard's end of the terminal of `omnid drive`, and its process."""
     keys, terminal = pty.openpty()
-    command = [sys.executable, "-m", "omnid", "drive", "--connect", f"tcp/127.0.0.1:{port}"]
+    command = [*OMNID, "drive", "--connect", f"tcp/127.0.0.1:{port}"]
     with subprocess.Popen(command, cwd=ROOT, stdin=terminal, stdout=terminal, stderr=subprocess.PIPE) as process:
         os.close(terminal)
         try:
@@ -148,16 +147,10 @@ def test_keys_arm_drive_and_stop(tmp_path: Path, course: Path) -> None:
         assert daemon.end()[0] == 0
 
 
-def test_without_a_robot_the_error_says_what_to_do(course: Path) -> None:
+def test_without_a_robot_the_error_says_what_to_do() -> None:
+    where = ("--connect", f"tcp/127.0.0.1:{free_port()}")
     with ExitStack() as ends:
-        line = [sys.executable, "-m", "omnid", "--connect", f"tcp/127.0.0.1:{free_port()}"]
-        pipe = subprocess.PIPE
-        for process in [
-            ends.enter_context(
-                subprocess.Popen([*line[:3], command, *line[3:]], stdout=pipe, stderr=pipe, text=True, cwd=ROOT)
-            )
-            for command in ("arm", "stop")
-        ]:
+        for process in [ends.enter_context(running([*OMNID, command, *where])) for command in ("arm", "stop")]:
             out, err = process.communicate(timeout=PATIENCE_S)
             assert process.returncode == 2 and out == ""
             assert err.startswith("omnid: cannot reach a robot at ") and err.count("\n") == 1
@@ -186,9 +179,7 @@ def test_sigterm_with_subscribers_that_do_not_read_stops_the_wheels_and_ends_in_
 
 def _started_listener(ends: ExitStack, daemon: Daemon) -> subprocess.Popen[str]:
     """Start `omnid listen` and return when it has shown a pose."""
-    line = [sys.executable, "-m", "omnid", "listen", "--connect", f"tcp/127.0.0.1:{daemon.port}"]
-    listener = ends.enter_context(subprocess.Popen(line, stdout=subprocess.PIPE, text=True, cwd=ROOT))
-    ends.callback(listener.kill)
+    listener = ends.enter_context(running([*OMNID, "listen", "--connect", f"tcp/127.0.0.1:{daemon.port}"]))
     assert listener.stdout is not None
     wait_until(lambda: "tracking" in listener.stdout.readline(), "a pose")
     return listener

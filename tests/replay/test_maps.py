@@ -23,7 +23,7 @@ from omnid.transport.codec import decode_diagnostics
 from omnid.transport.status_names import PLACES, Key
 from tests.drivers.logs.mcap_logs import STORE
 from tests.ports import free_port
-from tests.replay.command import Command
+from tests.replay.command import Command, recorded
 from tests.replay.live import Daemon, Operator, answers, command_line, started
 from tests.simulation import build, write_log
 from tests.simulation.rigs import with_upper_rotated
@@ -94,9 +94,8 @@ def test_what_is_not_recognised_is_left_out_with_a_warning(
     assert f"{omap}: no place of it was recognised" in result.err and omap.read_bytes() == before
     assert not (tmp_path / "m").read_bytes()
     assert result.err.count("poses are left out") == 1
-    with log.open("rb") as file:
-        topics = [channel.topic for _, channel, message in make_reader(file).iter_messages() if b"map" in message.data]
-    assert "/omnid/map_pose" in topics and "/tf" not in topics and "/omnid/map" not in topics
+    assert recorded(log, "/omnid/map_pose") and not recorded(log, "/omnid/map")
+    assert not any(b"map" in message for message in recorded(log, "/tf"))
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, WHEELS
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.ply import read_ply
-from tests.replay.command import Command, rows
+from tests.replay.command import Command, attached, recorded, rows
 from tests.replay.live import recorded_run
 
 METHODS = ([], ["--method", "paper"])
@@ -93,11 +93,9 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
     files = ("--record", out, "--tum", tum, "--cloud", ply)
     assert omnid.replay(scene / "log.mcap", *files, rig=tmp_path / "rig.toml").code == 0
     T_odom_rig = read_tum(tum).T
-    with out.open("rb") as file:
-        reader = make_reader(file)
-        found = [decode_pose(m.data) for _, _, m in reader.iter_messages(["/omnid/odom"])]
-        (cloud,) = [STORE.deserialize_cdr(m.data, s.name) for s, _, m in reader.iter_messages(["/omnid/cloud"])]
-        (grid,) = [decode_map(m.data) for _, _, m in reader.iter_messages(["/omnid/map"])]
+    found = [decode_pose(message) for message in recorded(out, ODOM)]
+    (cloud,) = [STORE.deserialize_cdr(m, "sensor_msgs/msg/PointCloud2") for m in recorded(out, "/omnid/cloud")]
+    (grid,) = map(decode_map, recorded(out, "/omnid/map"))
     assert cloud.header.frame_id == "odom"
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, 4)[:, :3]
     np.testing.assert_allclose(points, se3.apply(T_base_rig, read_ply(ply).xyz.astype(float)), atol=1e-5)
@@ -125,7 +123,6 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
         summary = reader.get_summary()
         assert summary is not None and summary.statistics is not None
         counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
-        attachments = {a.name: a.data for a in reader.iter_attachments()}
         assert [
             index.offset < chunk.chunk_start_offset
             for index in summary.attachment_indexes
@@ -144,9 +141,10 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
         "/tf_static": 1,
     }
     assert counts["/rover/scan"] == FEW_PAIRS  # ten a second, as the pairs are
-    rig = parse_rig(attachments["rig.toml"])
+    files = attached(out)
+    rig = parse_rig(files["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
-    assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"
+    assert parse(Config, files["omnid.toml"], origin="attached").bus.robot == "rover"
 
 
 def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Path, scene: Path) -> None:
@@ -156,9 +154,7 @@ def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Pat
     (tmp_path / "rig.toml").write_text(bare)
     out = tmp_path / "out.mcap"
     assert omnid.replay(scene / "log.mcap", "--record", out, *FEW, rig=tmp_path / "rig.toml").code == 0
-    with out.open("rb") as file:
-        attachments = {a.name: a.data for a in make_reader(file).iter_attachments()}
-    truth, found = read_rig(scene / "rig.toml"), parse_rig(attachments["rig.toml"])
+    truth, found = read_rig(scene / "rig.toml"), parse_rig(attached(out)["rig.toml"])
     for seen, exact in ((found.lower.mask, truth.lower.mask), (found.upper.mask, truth.upper.mask)):
         assert seen is not None and exact is not None
         assert abs(seen.outer_px - exact.outer_px) < 4 and np.hypot(*np.subtract(seen.center, exact.center)) < 2
@@ -230,12 +226,10 @@ def transforms(messages: list[Message], child: str) -> list[Message]:
 
 def test_a_recording_holds_all_messages_rig_and_settings(recording: Path, messages: list[Message], scene: Path) -> None:
     assert {message.topic for message in messages} >= set(PUBLISHED)
-    reader = LogReader(recording)
-    attached = reader.attachments()
-    reader.close()
-    settings = tomllib.loads(attached["omnid.toml"].decode())
+    files = attached(recording)
+    settings = tomllib.loads(files["omnid.toml"].decode())
     assert settings["record"]["enabled"] and settings["motor"]["port"].endswith("motor")
-    ours, theirs = parse_rig(attached["rig.toml"]), parse_rig((scene / "rig.toml").read_bytes())
+    ours, theirs = parse_rig(files["rig.toml"]), parse_rig((scene / "rig.toml").read_bytes())
     assert rig_toml(ours).splitlines()[:30] == rig_toml(theirs).splitlines()[:30]
     assert any(message.content.twist.linear.x > 0.1 for message in of(messages, "/omnid/drive")), "it drove"
     assert any(message.content.width > 100 for message in of(messages, "/omnid/cloud")), "there is a map"
@@ -257,11 +251,7 @@ def test_log_times_are_the_stamps(messages: list[Message]) -> None:
 
 def poses_of(log: Path) -> dict[int, np.ndarray]:
     """Return the positions by the stamps of their poses."""
-    with AnyReader([log]) as bag:
-        odometry = [bag.deserialize(data, place.msgtype) for place, _, data in bag.messages() if place.topic == ODOM]
-    stamps = [int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec) for message in odometry]
-    places = [message.pose.pose.position for message in odometry]
-    return {stamp: np.array([place.x, place.y, place.z]) for stamp, place in zip(stamps, places, strict=True)}
+    return {pose.stamp_ns: pose.T_odom_base[:3, 3] for pose in map(decode_pose, recorded(log, ODOM))}
 
 
 def test_a_replay_gives_the_same_trajectory(omnid: Command, tmp_path: Path, recording: Path) -> None:

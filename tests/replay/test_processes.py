@@ -2,58 +2,29 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
-import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zenoh
-from mcap.reader import make_reader
 
 from tests.conftest import PAIRS
 from tests.ply import read_ply
 from tests.ports import free_port
-from tests.replay.command import rows
+from tests.replay.command import recorded, rows
 from tests.replay.edited import images, save
-from tests.waiting import PATIENCE_S, wait_until
+from tests.waiting import OMNID, PATIENCE_S, ROOT, running, wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
-
-ROOT = Path(__file__).parents[2]
-
 
 PAUSE_PAIRS = 36_000  # an hour
 
 
-def replaying(scene: Path, *words: object) -> list[str]:
-    return [
-        sys.executable,
-        "-m",
-        "omnid",
-        "replay",
-        str(scene / "log.mcap"),
-        "--rig",
-        str(scene / "rig.toml"),
-        *map(str, words),
-    ]
-
-
-@contextmanager
-def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
-    """Yield a process that is killed at the end of the block."""
-    pipe = subprocess.PIPE
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+def replaying(scene: Path, *words: object) -> list[object]:
+    return [*OMNID, "replay", scene / "log.mcap", "--rig", scene / "rig.toml", *words]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +50,7 @@ def paused(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, code: int, manner: list[str]) -> None:
     tum, ply, log = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "out.mcap"
     command = replaying(paused, "--realtime", "--tum", tum, "--cloud", ply, "--record", log, "--verbose", *manner)
-    with started(command) as process:
+    with running(command) as process:
         wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
         process.send_signal(number)
         out, err = process.communicate(timeout=PATIENCE_S)
@@ -87,9 +58,7 @@ def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, 
     assert "Traceback" not in err and "poses" in out
     written = len(rows(tum))
     assert 3 <= written < PAIRS and len(read_ply(ply).xyz) > 0
-    with log.open("rb") as file:
-        recorded = sum(1 for _ in make_reader(file).iter_messages(["/omnid/odom"]))
-    assert recorded == written
+    assert len(recorded(log, "/omnid/odom")) == written
 
 
 def test_the_ten_lines_of_the_document_hear_a_robot_without_omnid(scene: Path) -> None:
@@ -106,10 +75,10 @@ def test_the_ten_lines_of_the_document_hear_a_robot_without_omnid(scene: Path) -
     ):
         config.insert_json5(key, value)
     sets = ("--set", "bus.listen=[]", "--set", f'bus.connect=["{endpoint}"]')
-    with zenoh.open(config) as session, started(program) as hears:
+    with zenoh.open(config) as session, running(program) as hears:
         publisher: Any = session.declare_publisher("omnid/odom")  # zenoh's stub takes its status for a bool
         wait_until(lambda: publisher.matching_status.matching)
-        with started(replaying(scene, "--publish", "--quiet", *sets)) as process:
+        with running(replaying(scene, "--publish", "--quiet", *sets)) as process:
             assert hears.stdout is not None
             assert "Point(x=" in hears.stdout.readline()
             assert process.wait(PATIENCE_S) == 0
@@ -121,14 +90,8 @@ def test_a_full_disk_leaves_whole_rows(tmp_path: Path, scene: Path) -> None:
     Compiled modules are not written: they would be cut, too.
     """
     tum = tmp_path / "est.txt"
-    limited = [
-        "env",
-        "PYTHONDONTWRITEBYTECODE=1",
-        "prlimit",
-        "--fsize=1000",
-        *replaying(scene, "--quiet", "--tum", tum),
-    ]
-    with started(limited) as process:
+    limited = ["prlimit", "--fsize=1000", *replaying(scene, "--quiet", "--tum", tum)]
+    with running(limited, {"PYTHONDONTWRITEBYTECODE": "1"}) as process:
         _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2 and err.startswith("omnid: ") and err.count("\n") == 1 and str(tum) in err
     assert 0 < len(rows(tum)) < PAIRS

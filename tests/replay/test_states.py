@@ -11,17 +11,15 @@ from typing import Final, Literal, NamedTuple
 import cv2
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from calib import se3
 from calib.rig_file import read_rig
 from omnid.api import replay
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.transport.codec import Pose, decode_pose
+from omnid.transport.codec import decode_diagnostics, decode_pose
 from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
-from tests.drivers.logs.mcap_logs import STORE
-from tests.replay.command import Command, rows
+from tests.replay.command import Command, recorded, rows
 from tests.replay.edited import Image, Pixels, dark, images, repeat_lines, roll, save, shift, tear, turn
 from tests.simulation import build, write_log
 from tests.simulation.logs import Readout
@@ -29,21 +27,19 @@ from tests.simulation.logs import Readout
 DARK_PAIRS = 20  # pairs, 2 s
 
 
-def recorded(path: Path) -> list[Pose]:
-    with path.open("rb") as file:
-        return [decode_pose(m.data) for _, _, m in make_reader(file).iter_messages(["/omnid/odom"])]
-
-
 def states(path: Path) -> list[tuple[str, int]]:
     """Return state and reset counter whenever they change."""
     found = []
-    with path.open("rb") as file:
-        for schema, _, message in make_reader(file).iter_messages(["/omnid/status"]):
-            status = STORE.deserialize_cdr(message.data, schema.name).status[0]
-            values = {pair.key: pair.value for pair in status.values}
-            if status.name == ODOMETRY:
-                found.append((values["state"], int(values["resets"])))
+    for message in recorded(path, "/omnid/status"):
+        status = decode_diagnostics(message).statuses[0]
+        if status.name == ODOMETRY:
+            found.append((status.values["state"], int(status.values["resets"])))
     return found
+
+
+def sigmas_m(log: Path) -> np.ndarray:
+    """Return the standard deviations of the recorded positions."""
+    return np.array([np.trace(decode_pose(pose).covariance[:3, :3]) for pose in recorded(log, "/omnid/odom")]) ** 0.5
 
 
 def errors_m(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
@@ -72,7 +68,7 @@ def test_two_seconds_of_darkness(omnid: Command, tmp_path: Path, scene: Path) ->
     assert result.code == 0 and len(rows(tmp_path / "est")) == PAIRS + DARK_PAIRS
     found = states(tmp_path / "out.mcap")
     assert ("lost", 0) in found and found[-1] == ("tracking", 0)
-    sigma_m = np.array([np.sqrt(np.trace(r.covariance[:3, :3])) for r in recorded(tmp_path / "out.mcap")])
+    sigma_m = sigmas_m(tmp_path / "out.mcap")
     assert (np.diff(sigma_m[13 : 11 + DARK_PAIRS]) > 0).all() and sigma_m[10 + DARK_PAIRS] > 10 * sigma_m[11]
     assert sigma_m[-1] < 0.02
     estimate, truth = read_tum(tmp_path / "est"), read_tum(scene / "truth.txt")
@@ -105,8 +101,7 @@ def test_another_scene_after_the_dark(omnid: Command, tmp_path: Path, scene: Pat
     omnid.replay(log, "--record", tmp_path / "out.mcap", rig=scene / "rig.toml")
     found = states(tmp_path / "out.mcap")
     assert found[-1] == ("tracking", 1)
-    last = recorded(tmp_path / "out.mcap")[-1]
-    assert np.sqrt(np.trace(last.covariance[:3, :3])) > 0.5  # the gap stays in the covariance
+    assert sigmas_m(tmp_path / "out.mcap")[-1] > 0.5  # the gap stays in the covariance
 
 
 def test_cameras_that_are_exchanged_on_the_way(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from calib import se3
@@ -24,6 +23,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
+from tests.replay.command import recorded
 from tests.replay.edited import dark, images
 from tests.simulation.logs import SensorErrors, motion_samples
 
@@ -61,11 +61,6 @@ def offsets_m(result: RunResult, scene: Path) -> NDArray[np.float64]:
     truth = read_tum(scene / "truth.txt").T
     true = (se3.inverse(truth[0]) @ truth)[:, :3, 3]
     return np.asarray(np.linalg.norm(result.T_odom_rig[:, :3, 3] - true, axis=1))
-
-
-def recorded(path: Path, topic: str) -> list[bytes]:
-    with path.open("rb") as file:
-        return [message.data for _, _, message in make_reader(file).iter_messages([topic])]
 
 
 def saved(path: Path, scene: Path, more: Sequence[Entry]) -> Path:

@@ -38,8 +38,8 @@ from omnid.engine.process import RealtimeSettings
 from omnid.errors import OmnidError
 from tests.contract.simulated_controllers import PtyMotor
 from tests.omnid.controller.bench import PERIOD_S, UNATTENDED, Wheels
-from tests.replay.live import ROOT, Base
-from tests.waiting import wait_until
+from tests.replay.live import Base
+from tests.waiting import ROOT, wait_until
 
 HEAVY = (
     "calib.models",

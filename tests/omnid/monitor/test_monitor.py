@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
@@ -31,23 +30,9 @@ from omnid.transport.status_names import BUS, DISARMED_BY_STOP, NAVIGATION, WHEE
 from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC
 from omnid.transport.topics import Answer, Request
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, script
-from tests.waiting import wait_until
+from tests.waiting import OMNID, running, wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
-
-
-@contextlib.contextmanager
-def listening(*words: object) -> Iterator[subprocess.Popen[str]]:
-    with subprocess.Popen(
-        [sys.executable, "-m", "omnid", "listen", *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
 
 
 def odometry_at(number: int) -> bytes:
@@ -81,7 +66,7 @@ def publish_until_it_ends(
 def test_listen_shows_the_robot_and_ends_with_a_signal() -> None:
     endpoint = free_endpoint()
     rover = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
-    with rover as bus, listening("--robot", "rover", "--connect", endpoint) as it:
+    with rover as bus, running([*OMNID, "listen", "--robot", "rover", "--connect", endpoint]) as it:
         out, err = publish_until_it_ends(bus, it, signal.SIGTERM)
     assert it.returncode == 0 and err == "" and "\x1b" not in out
     last = out.splitlines()[-1]
@@ -91,7 +76,7 @@ def test_listen_shows_the_robot_and_ends_with_a_signal() -> None:
 def test_a_wrong_name_is_reported() -> None:
     endpoint = free_endpoint()
     idle = contextlib.closing(Bus(BusConfig(listen=(endpoint,), robot="hall/one")))
-    with idle, listening("--connect", endpoint, "--seconds", 0.5) as it:
+    with idle, running([*OMNID, "listen", "--connect", endpoint, "--seconds", 0.5]) as it:
         out, _ = it.communicate(timeout=DEADLINE_S)
     assert it.returncode == 1 and out == "omnid: no pose yet: no robot of this name is there\n"
 

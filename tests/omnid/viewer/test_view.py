@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
@@ -32,6 +29,7 @@ from omnid.transport.topics import PUBLISHED, ros_name
 from tests.conftest import PAIRS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command
+from tests.waiting import OMNID, running
 
 WITHOUT = "needs rerun: pip install 'rerun-sdk>=0.41'"
 
@@ -110,28 +108,6 @@ def test_without_rerun_the_installation_is_named(scene: Path, omnid: Command, mo
     assert f"{sys.executable} -m pip install 'rerun-sdk" in omnid.refused("view", scene / "log.mcap", "-o", "x.rrd")
 
 
-@contextlib.contextmanager
-def viewing(home: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
-    """Run `omnid view` with a home folder of its own."""
-    environment = os.environ | {
-        "DISPLAY": "",
-        "WAYLAND_DISPLAY": "",
-        "HOME": str(home),
-        "XDG_CONFIG_HOME": str(home / "config"),
-    }
-    with subprocess.Popen(
-        [sys.executable, "-m", "omnid", "view", *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 def publish(bus: Bus, number: int) -> None:
     """Publish a pose, an image, a map and a status; some are damaged."""
     stamp_ns, T = START_NS + number * 10**7, se3.transform(np.eye(3), [0.01 * number, 0.5, 0.0])
@@ -155,8 +131,9 @@ def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
     need_rerun()
     endpoint, drawn = free_endpoint(), tmp_path / "live.rrd"
     publishing = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
-    viewer = viewing(tmp_path, "--robot", "rover", "--connect", endpoint, "-o", drawn, "--seconds", 2)
-    with publishing as bus, viewer as it:
+    words = ("view", "--robot", "rover", "--connect", endpoint, "-o", drawn, "--seconds", 2)
+    home = {"DISPLAY": "", "WAYLAND_DISPLAY": "", "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path / "config")}
+    with publishing as bus, running([*OMNID, *words], home) as it:
         deadline_s = time.monotonic() + DEADLINE_S
         for number in count():
             publish(bus, number)

@@ -6,17 +6,13 @@ import http.client
 import json
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
-from tests.waiting import PATIENCE_S, ended
-
-ROOT = Path(__file__).parents[3]
+from tests.waiting import OMNID, PATIENCE_S, ended, running
 
 
 class HttpAnswer(NamedTuple):
@@ -94,15 +90,11 @@ class WebServer:
 @contextmanager
 def served(*words: object) -> Iterator[WebServer]:
     """Yield a server on a free port; it is killed at the end of the block."""
-    command = [sys.executable, "-m", "omnid", "web", "--listen", "127.0.0.1:0", *map(str, words)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            assert line, process.communicate()[1]
-            yield WebServer(process, line.strip())
-        finally:
-            process.kill()
+    with running([*OMNID, "web", "--listen", "127.0.0.1:0", *words]) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line, process.communicate()[1]
+        yield WebServer(process, line.strip())
 
 
 class Shown:
