@@ -71,8 +71,9 @@ def motion_errors(rig: Rig) -> MotionErrors:
     """Return the errors of motions by the rig's covariance, or by UNSTATED_* where it has none."""
     covariance = rig.covariance
     if covariance is None:
-        sigmas = np.array([UNSTATED_TURN_RAD] * 3 + [UNSTATED_SCALE * rig.baseline_m])
-        covariance = RigCovariance.of_matrix(("r_x", "r_y", "r_z", "baseline"), np.diag(sigmas**2))
+        turn, longer = UNSTATED_TURN_RAD, UNSTATED_SCALE * rig.baseline_m
+        variances = np.square([turn, turn, turn, longer])
+        covariance = RigCovariance.of_matrix(("r_x", "r_y", "r_z", "baseline"), np.diag(variances))
     # 1. Independent errors: a root of the correlations, whose eigenvalues may be negative by rounding.
     is_open = covariance.sigmas > 0
     eigenvalues, vectors = np.linalg.eigh(covariance.correlation * np.outer(is_open, is_open))
@@ -122,33 +123,27 @@ def _motion_by_parameters(
     The points' pixels stay the same. Their triangulation at the start: J_point dX + J_parameter = 0. The pose at the
     end, by the same pixels' equations: J_point dX + J_pose dp + J_parameter = 0, in least squares.
     """
-    T_rig_rect = se3.inverse(rig.T_rect_rig)
+    T_rig_rect, (names, units) = se3.inverse(rig.T_rect_rig), scaled
+
+    def derivatives(points: Array) -> Array:
+        """Return those (N, 4, 3 + P) of the pixels of points by their position and by the parameters."""
+
+        def pixels(changes: Array) -> Array:
+            shift, own = np.split(changes, [3])
+            moved = moved_rig(rig, dict(zip(names, (own * units).tolist(), strict=True)))
+            return _pixels(moved, se3.apply(T_rig_rect, points + shift))
+
+        return central_differences(pixels, np.repeat([BEST_STEP, 1.0], [3, len(names)]))
+
     T_end_start = se3.inverse(se3.exp(motion))
     ends = se3.apply(T_end_start, points)
-    first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
-    by_start, by_end = (
-        central_differences(
-            lambda shift, at=at: _pixels(rig, se3.apply(T_rig_rect, at + shift)),  # type: ignore[misc]
-            BEST_STEP * np.ones(3),
-        )
-        for at in (points, ends)
-    )
-    seen = np.all([np.isfinite(part).all(axis=(1, 2)) for part in (first, last, by_start, by_end)], axis=0)
+    start, end = derivatives(points), derivatives(ends)
+    seen = np.isfinite(start).all(axis=(1, 2)) & np.isfinite(end).all(axis=(1, 2))
     if seen.sum() < len(motion):
         return None
-    first, last, by_start, by_end, ends = (part[seen] for part in (first, last, by_start, by_end, ends))
+    (by_start, first), (by_end, last) = (np.split(part[seen], [3], axis=2) for part in (start, end))
     shift = -se3.R_of(T_end_start) @ np.linalg.pinv(by_start) @ first  # (N, 3, P), in the axes of the end
     # The pose moves and turns the points the other way: dX_end = -dp - w x X_end.
-    by_pose = np.concatenate([-by_end, by_end @ se3.hat(ends)], axis=2)
+    by_pose = np.concatenate([-by_end, by_end @ se3.hat(ends[seen])], axis=2)
     right = (by_end @ shift + last).reshape(-1, first.shape[2])
     return np.asarray(-np.linalg.lstsq(by_pose.reshape(-1, 6), right, rcond=None)[0])
-
-
-def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...], Array]) -> Array:
-    """Return the derivatives (N, 4, P) of the pixels of points (N, 3) in the rig frame."""
-    names, units = scaled
-
-    def pixels(changes: Array) -> Array:
-        return _pixels(moved_rig(rig, dict(zip(names, (changes * units).tolist(), strict=True))), in_rig)
-
-    return central_differences(pixels, np.ones(len(names)))

@@ -74,7 +74,8 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
     mu = LARGEST_SQUARED / max(2 * largest - LARGEST_SQUARED, LARGEST_SQUARED)
     for _ in range(MAX_STEPS):
         # 1. The weights of the loops at this mu; 2. one step of Gauss-Newton; 3. a steeper cost.
-        weights[loop] = _weights((residual[loop] ** 2).sum(axis=1), mu)
+        ratio = np.sqrt(LARGEST_SQUARED / np.maximum((residual[loop] ** 2).sum(axis=1), 1e-12))
+        weights[loop] = np.clip(ratio * np.sqrt(mu * (mu + 1)) - mu, 0.0, 1.0)
         change = graph.solve(residual, J, weights)
         poses = poses @ se3.exp(change)
         residual, J = graph.linearised(poses)
@@ -149,12 +150,6 @@ def _inverse_right_jacobian(xi: Array) -> Array:
     ad[:, :3, :3] = ad[:, 3:, 3:] = se3.hat(xi[:, 3:])
     ad[:, :3, 3:] = se3.hat(xi[:, :3])
     return np.asarray(np.eye(6) + ad / 2 + ad @ ad / 12)
-
-
-def _weights(squared: Array, mu: float) -> Array:
-    """Return weights 0..1 of loops with squared residuals (L,)."""
-    ratio = np.sqrt(LARGEST_SQUARED / np.maximum(squared, 1e-12))
-    return np.asarray(np.clip(ratio * np.sqrt(mu * (mu + 1)) - mu, 0.0, 1.0))
 
 
 def connected(ids: Sequence[int], pairs: ArrayLike) -> list[list[int]]:
