@@ -10,20 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from calib.boards.board import Board
-from calib.boards.corner_candidates import (
-    Grey,
-    Image,
-    find_corners,
-    sample,
-    smoothed,
-)
+from calib.boards.corner_candidates import Grey, Image, find_corners, sample, smoothed
 from calib.boards.corner_grid import ALONG, Grid, find_grids, grow_grid, with_clockwise_axes
-from calib.boards.local_mapping import (
-    local_mapping,
-    quadratic_terms,
-    refined_corners,
-    without_outliers,
-)
+from calib.boards.local_mapping import local_mapping, quadratic_terms, refined_corners, without_outliers
 from calib.models.camera import Array
 
 # Least score of a board: right ones in hard renderings have 0.5 to 0.75, others 0.3 at most.

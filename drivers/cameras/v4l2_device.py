@@ -17,12 +17,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from drivers.cameras import v4l2_ioctl as v4l2
-from drivers.cameras.camera_state import (
-    CameraExposure,
-    ExposureRanges,
-    ExposureSetting,
-    ValueRange,
-)
+from drivers.cameras.camera_state import CameraExposure, ExposureRanges, ExposureSetting, ValueRange
 from drivers.cameras.v4l2_ioctl import ControlId, ExposureMode
 from drivers.errors import DriverError
 

@@ -11,12 +11,7 @@ import numpy as np
 
 from calib.fit.least_squares import ROUNDS
 from calib.fit.parameters import TIMES, RigParameters
-from calib.fit.rig_from_drive import (
-    CORRELATED_OBSERVATIONS,
-    DriveAdjustment,
-    adjust_drive,
-    observation_sigma,
-)
+from calib.fit.rig_from_drive import CORRELATED_OBSERVATIONS, DriveAdjustment, adjust_drive, observation_sigma
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera

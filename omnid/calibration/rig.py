@@ -20,11 +20,7 @@ from calib.rig_file import write_rig
 from calib.rim import find_rim
 from calib.validation import LineReporter, silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
-from omnid.calibration.board_search import (
-    find_boards,
-    require_one_orientation,
-    view_of_tags,
-)
+from omnid.calibration.board_search import find_boards, require_one_orientation, view_of_tags
 from omnid.calibration.images import PairedImages, brightest, read_pairs
 from omnid.calibration.rig_report import angle_lines, angle_rows, rig_report_html
 from omnid.errors import OmnidError

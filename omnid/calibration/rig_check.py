@@ -14,13 +14,7 @@ from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import TOLERANCE_NS, spread_pairs
 from omnid.config import PanoramaConfig
-from omnid.core.rig.rig_health import (
-    MIN_MATCHES,
-    RigFinding,
-    RigState,
-    judge,
-    match,
-)
+from omnid.core.rig.rig_health import MIN_MATCHES, RigFinding, RigState, judge, match
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.stages.geometry import Dewarp, geometry, with_rims
