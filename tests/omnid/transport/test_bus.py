@@ -171,7 +171,7 @@ def test_a_taken_or_silent_endpoint_is_refused_with_the_setting_to_change() -> N
         Bus(BusConfig(robot="other", listen=(endpoint,)))
     text = str(caught.value)
     assert endpoint in text and "bus.listen" in text and "Address already in use" in text and "\n" not in text
-    with pytest.raises(Unreachable, match=r"change bus.connect"):
+    with pytest.raises(Unreachable, match=r"by --connect or bus\.connect"):
         Robot(connect=(endpoint,))
     with pytest.raises(OmnidError, match="an example is") as wrong:
         open_client(BusConfig(connect=("nowhere",)))
