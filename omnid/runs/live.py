@@ -23,6 +23,7 @@ from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.logs.mcap_writer import RotatingLog
+from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.ipc import ARMED, ControllerStart
 from omnid.controller.link import ControllerLink, DriveLink
@@ -43,7 +44,6 @@ from omnid.sinks.encoder import BusSink, Encoder, PanoramaSink
 from omnid.sinks.recorder import Recorder
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.obstacles import FLOOR_WARNING
-from omnid.stages.synchronise import MotionInbox
 from omnid.transport import status_names as names
 from omnid.transport import topics
 from omnid.transport.codec import Diagnostics, compile_serialisers
@@ -66,10 +66,10 @@ class LiveRobot(Protocol):
     states: Mapping[Camera, CameraState]  # of the cameras, once they are open
     clock: RobotClock  # of the stamps of images, poses and ticks
 
-    def connect(self, session: Session, motion: MotionInbox, /) -> tuple[list[Stream[Frame]], DriveLink | None]:
+    def connect(self, session: Session, /) -> tuple[Sequence[Stream[Frame | MotionSample]], DriveLink | None]:
         """Open the cameras and start the controller; return the sources of the images, and None without wheels.
 
-        Outputs of the session close them. motion: takes the samples that come with the images.
+        Outputs of the session close them.
         """
 
 
@@ -84,7 +84,7 @@ class ConnectedRobot:
         self.states: Mapping[Camera, CameraState] = {}
         self.clock = RobotClock()
 
-    def connect(self, session: Session, _: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink | None]:
+    def connect(self, session: Session) -> tuple[Sequence[Stream[Frame]], DriveLink | None]:
         """Open the cameras, and start the controller process where there is a motor; it waits for its answer.
 
         The wheels stop, and the process ends, at the latest with the outputs of the session. Raises DriverError for
@@ -152,7 +152,7 @@ def _connect(session: Session, front_end: FrontEnd, robot: LiveRobot) -> RunPlac
     rig, health, motion = front_end.geometry.rig, front_end.health, front_end.pairing.motion
 
     # 1. Cameras and wheels, the bus, the map of places.
-    frames, controller = robot.connect(session, motion)
+    frames, controller = robot.connect(session)
     bus = session.open_bus(rig, gives_time=robot.waits)
     run_places = RunPlaces(config, front_end.geometry, session.warn)
 

@@ -123,7 +123,7 @@ class Session:
 class Inputs:
     """The inputs of a run: images, its map of places, its wheels."""
 
-    frames: Sequence[Stream[Frame | MotionSample]] | Sequence[Stream[Frame]]
+    frames: Sequence[Stream[Frame | MotionSample]]
     map: RunPlaces  # of places, to begin with, and its file
     controller: DriveLink | None = None  # of a live run; its commands leave the run
     requests: Stream[NavigationCommand] | None = None  # None: the run does not navigate

@@ -14,6 +14,7 @@ from typing import Any
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame
+from drivers.motion import MotionSample
 from drivers.motor import VelocityCommand
 from drivers.motors.simulated_motor import Pose
 from omnid.config import Config
@@ -27,7 +28,6 @@ from omnid.engine.robot_clock import fixed_offset
 from omnid.runs.wiring import Session
 from omnid.simulation.robot import SimulatedRobot, Tick, Vehicle
 from omnid.simulation.world import World
-from omnid.stages.synchronise import MotionInbox
 from omnid.transport.status_names import SIMULATION, Key
 
 
@@ -63,12 +63,12 @@ class PacedRobot:
         self.truth: dict[int, Pose] = {}  # true poses of the base in the world by the stamps of the pairs
         self.contacts, self._touches, self._closed = 0, False, False
 
-    def connect(self, session: Session, motion: MotionInbox) -> tuple[list[Stream[Frame]], DriveLink]:
+    def connect(self, session: Session) -> tuple[list[Stream[Frame | MotionSample]], DriveLink]:
         """Return one source of both cameras, which advances the time, and the link to the controller."""
         graph, self._report = session.graph, session.warn
         graph.stats["motor"] = self._ticks
         session.parts[SIMULATION] = self.stats
-        return [graph.source("cameras", lambda: self._frames(graph.settle, motion), wake=self.close)], self
+        return [graph.source("cameras", lambda: self._messages(graph.settle), wake=self.close)], self
 
     def stats(self) -> dict[str, Any]:
         """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
@@ -102,14 +102,13 @@ class PacedRobot:
         while (command := self._commands.get()) is not None:
             yield command
 
-    def _frames(self, settle: Callable[[], None], motion: MotionInbox) -> Iterator[Frame]:
+    def _messages(self, settle: Callable[[], None]) -> Iterator[Frame | MotionSample]:
         """Advance from pair to pair; settle: returns when the daemon has answered."""
         vehicle, due_ns, period_ns = self._vehicle, 0, round(NS_PER_S / self._vehicle.robot.rate_hz)
         try:
             for pair in vehicle.pairs(settle):
                 self.truth[pair.stamp_ns] = vehicle.base.pose
-                for sample in pair.samples:
-                    motion.add(sample)
+                yield from pair.samples
                 # Images are not given before their time; a pair that comes late is not made up for.
                 sleep_until(due_ns, lambda: self._closed)
                 if self._closed:

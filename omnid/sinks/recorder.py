@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter, RotatingLog, RotatingLogState
+from drivers.motion import MotionSample
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import FramePair
@@ -16,7 +17,7 @@ from omnid.sinks.encoder import Encoder, Outgoing
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.topics import PUBLISHED, ros_name
 
-Recorded: TypeAlias = Frame | FramePair | Outgoing
+Recorded: TypeAlias = Frame | MotionSample | FramePair | Outgoing  # samples are recorded with the pose of their pair
 
 
 class SingleLog:
@@ -97,7 +98,7 @@ class Recorder:
         if isinstance(message, FramePair):
             previous, self._period_index = self._period_index, message.stamp_ns // self._period_ns
             frames = message.frames if self._period_index != previous else ()
-        elif encode is not None and not isinstance(message, Frame):
+        elif encode is not None and not isinstance(message, Frame | MotionSample):
             for topic, payload in encode(message):
                 self._log.write(ros_name(self._robot, topic), PUBLISHED[topic].schema, payload, stamp_ns)
         for frame in frames:
