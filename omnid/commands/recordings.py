@@ -215,10 +215,7 @@ def _draw_recording(sink: RerunSink, log: Path, topic: str | None) -> None:
 def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
     """Draw a live robot until a signal, or for a number of seconds."""
     end_s, signals, state = time.monotonic() + seconds, list[int](), RobotState()
-    with (
-        handle_stop_signals(lambda number, _: signals.append(number)),
-        Robot(settings=config.bus) as robot,
-    ):
+    with handle_stop_signals(lambda number, _: signals.append(number)), Robot(settings=config.bus) as robot:
         for topic in (ODOMETRY, SCAN, PANORAMA, STATUS, CLOUD):
             robot.on_message(state.put, topic, kept=topic in (STATUS, CLOUD))
         while time.monotonic() < end_s and not signals:

@@ -192,8 +192,9 @@ def replay_and_print(log: Path, config: Config, asked: ReplayOptions, args: argp
         entries = summary_entries(result.counters, verbose=args.verbose)
         pairs_hz = result.counters.pairs / max(1e-3, result.elapsed_s)
         entries["speed"] = f"{pairs_hz:.1f} pairs/s, in {result.elapsed_s:.1f} s"
-        if files := [path for _, path in asked.files] + ([result.map_file] if result.map_file else []):
-            entries["written"] = ", ".join(map(str, files))
+        written = [*(path for _, path in asked.files), result.map_file, getattr(args, "rerun", None)]
+        if any(written):
+            entries["written"] = ", ".join(str(path) for path in written if path)
         lines = [f"{name:<9} {text}" for name, text in entries.items()]
         print(*(timing_table(result.timings) if args.verbose else ()), *lines, sep="\n")
     return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))

@@ -25,12 +25,7 @@ away from them, and have the emergency stop at hand. The daemon must not run. Ct
 begin: """
 
 
-def tested_drive(
-    config: MotorSettings,
-    ask: Callable[[str], str],
-    *,
-    speed_mps: float,
-) -> DifferentialDrive:
+def tested_drive(config: MotorSettings, ask: Callable[[str], str], *, speed_mps: float) -> DifferentialDrive:
     """Turn the wheels, ask what they did, and return the settings of the drive as the wiring is.
 
     ask: prints a question, returns the answer. speed_mps: of a wheel. The wheels stop at the end. Raises OmnidError for

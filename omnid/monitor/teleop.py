@@ -79,11 +79,7 @@ def teleoperate(bus: BusConfig) -> int:
     """Drive the robot until `q`; return the exit code. OmnidError without a terminal, or where it cannot be reached."""
     if not sys.stdin.isatty():
         raise OmnidError("omnid drive needs a keyboard: run it in a terminal")
-    with (
-        raw_keys() as keys,
-        Robot(settings=bus) as robot,
-        robot.subscribe(Diagnostics) as statuses,
-    ):
+    with raw_keys() as keys, Robot(settings=bus) as robot, robot.subscribe(Diagnostics) as statuses:
         driver, stick = robot.driver(), Stick(limits_of(robot))
         driver.require_connected()
         print("arrows: drive  space: stop  a: arm  +/-: speed  q: quit")

@@ -530,9 +530,8 @@ def path_from_cdr(payload: bytes, _: bytes = b"", *, schema: str = PATH_SCHEMA) 
 
 
 def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> Values:
-    half_rad = 0.0 if heading_rad is None else 0.5 * heading_rad
-    w = 0.0 if heading_rad is None else math.cos(half_rad)
-    return (x_m, y_m, 0.0), (0.0, 0.0, math.sin(half_rad), w)
+    turn = (0.0, 0.0) if heading_rad is None else (math.sin(heading_rad / 2), math.cos(heading_rad / 2))
+    return (x_m, y_m, 0.0), (0.0, 0.0, *turn)
 
 
 # Images.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import re
 import sys
@@ -79,7 +80,9 @@ def drawn(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drawn")
     log = [str(scene / "log.mcap"), "--rig", str(scene / "rig.toml"), "--quiet"]
     assert main(["replay", *log, "--tum", str(folder / "est.txt"), "--record", str(folder / "rec.mcap")]) == 0
-    assert main(["replay", *log, "--rerun", str(folder / "out.rrd")]) == 0
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(["replay", *log, "--rerun", str(folder / "out.rrd")]) == 0
+    assert f"written   {folder / 'out.rrd'}\n" in printed.getvalue()
     return folder
 
 
