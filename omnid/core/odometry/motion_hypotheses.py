@@ -82,10 +82,10 @@ class OtherMotion:
             each for each in candidates if (each.cost - best.cost) * min(each.in_view, best.in_view) < DECIDING_COST
         ]
         chosen = min(likely, key=lambda each: each.distance_m(T_predicted))
-        # 2. The candidate farthest from it is the other motion.
+        # 2. The candidate farthest from it is the other motion. Where the images decide against what was predicted, the
+        #    doubt goes on: that one is as far, and sought there.
         if self.is_open and chosen.distance_m(T_predicted) > REACH_SIGMAS * sigma_mps * dt_s:
-            self.agree()
-            self.is_open = True
+            self._past, self._displacement = self._past + self._displacement, np.zeros(6)
         others = [each for each in likely if each.distance_m(chosen.T_odom_rect) > SAME_M]
         if others:
             off_m = self._displacement[:3] - chosen.T_odom_rect[:3, 3]

@@ -22,7 +22,6 @@ RANSAC_THRESHOLD_PX = 2.0
 # Hypotheses that are drawn at once and at most, and the probability that none of them was free of outliers at which the
 # search ends: half a day's drive misses one. The most are enough where 31 % of the landmarks are right.
 RANSAC_BATCH, RANSAC_MOST, RANSAC_MISSED = 16, 480, 1e-6
-GOOD_GUESS = 0.8  # share of the landmarks that agree with no motion, above which none is sought
 # Steps at most, after the first of which outliers do not count any more.
 GAUSS_NEWTON_STEPS, OUTLIER_STEPS = 6, 2  # enough: 305 of 306 fits of test_pose_estimation.py converge in 5
 CONVERGED = 1e-5  # m and rad: a smaller step is the last one, because it moves no view by a hundredth of a pixel
@@ -77,9 +76,9 @@ def consensus(a: Array, b: Array, agree: Callable[[Array], Flags], rng: np.rando
     """Return the motion T_b_a with the largest consensus set of points (N, 3), and the set's flags (N,).
 
     Three pairs of points, of which b may be NaN where it is unknown, give a hypothesis: Dang et al. 2012, section IV.B.
-    agree: returns flags (K, N) of the points that agree with motions (K, 4, 4). No motion is the first hypothesis:
-    nothing is drawn where nearly all agree with it, as where the points are those of a good guess. Others are drawn in
-    batches until three inliers have almost certainly been among them.
+    agree: returns flags (K, N) of the points that agree with motions (K, 4, 4). No motion is the first hypothesis.
+    Others are drawn in batches until three inliers have almost certainly been among them, also where most agree with
+    the first: a few that are near tell a turn from a step aside, and the others agree with both.
     """
     usable, motions = np.flatnonzero(np.isfinite(b).all(axis=1)), np.eye(4)[None]
     best, chosen = motions[0], np.zeros(len(a), bool)
@@ -92,7 +91,7 @@ def consensus(a: Array, b: Array, agree: Callable[[Array], Flags], rng: np.rando
         if agreeing[most].sum() > chosen.sum():
             best, chosen = motions[most], agreeing[most]
         share = float(chosen.mean()) if len(chosen) else 0.0
-        if len(usable) < 3 or (share > GOOD_GUESS if not drawn else (1 - share**3) ** drawn < RANSAC_MISSED):
+        if len(usable) < 3 or (1 - share**3) ** drawn < RANSAC_MISSED:
             break
     return best, chosen
 

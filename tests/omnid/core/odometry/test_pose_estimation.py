@@ -14,7 +14,7 @@ from calib.fit import rig_uncertainty
 from calib.panorama import Cylinder
 from calib.rig import Rig, RigCovariance
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.pose_estimation import gauss_newton
+from omnid.core.odometry.pose_estimation import gauss_newton, ransac
 from omnid.core.odometry.rig_error import RigError
 from omnid.core.stereo.triangulation import point_covariance, view
 from omnid.core.types.pixel_times import PixelTimes
@@ -53,6 +53,16 @@ def test_the_covariance_matches_the_scatter() -> None:
     W = np.linalg.inv(np.linalg.cholesky(np.mean(reported, axis=0)))
     spread = np.sqrt(np.linalg.eigvalsh(W @ np.cov(np.array(errors).T) @ W.T))
     assert spread.min() > 0.7 and spread.max() < 1.3
+
+
+def test_a_few_near_landmarks_tell_a_step_aside_from_a_turn() -> None:
+    """As before a wall, where the others agree with both, and with no motion as well, within the noise of tracks."""
+    rng = np.random.default_rng(1)
+    far_m = np.repeat([6.0, 2.0], [90, 10])[:, None]
+    points = far_m * np.column_stack([np.ones(100), rng.uniform(-0.25, 0.25, (100, 2))])
+    step = se3.exp([0.0, 0.03, 0.0, 0.0, 0.0, 0.0])
+    T, agree = ransac(points, views_of(points, step), MODEL, rng)
+    assert agree.all() and np.abs(T - step).max() < 1e-6
 
 
 BASELINE_M, SCALE = 0.2, 0.01
