@@ -27,6 +27,7 @@ from omnid.core.odometry.plane_patches import (
     AlignedPatches,
     align,
     moved_slopes,
+    plane_maps,
     plane_templates,
 )
 from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED
@@ -286,11 +287,11 @@ class LocalMap:
         """
         table, T_curr_ref = self.table, self.from_anchors(se3.inverse(T_odom_rect), landmarks)
         templates = np.empty((len(landmarks), WINDOW_PX + 2, WINDOW_PX + 2), np.float32)
+        surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
+        maps = plane_maps(surfaces, T_curr_ref, predicted, self._model, upper=upper)
         for seq, keyframe in self.keyframes.items():
             own = np.flatnonzero(table.anchor[landmarks] == seq)
-            rows = landmarks[own]
-            seen = table.anchor_pixels[rows], (table.anchor_points[rows], table.slopes[rows]), T_curr_ref[own]
-            templates[own] = plane_templates(keyframe.lower, *seen, self._model, predicted[own], upper=upper)
+            templates[own] = plane_templates(keyframe.lower, table.anchor_pixels[landmarks[own]], maps[own])
         return align(templates, panorama, predicted, reach_px)
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:

@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 # Enough: 98 % of the patches of test_plane_patches.py end before; a last step is below the hundredths that noise
 # leaves.
@@ -30,45 +31,28 @@ GRADIENT_NOISE, MIN_TRUE_GRADIENT = 0.12, 0.2
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
 
 
-@compiled(
-    "(u1[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1], f8, f4[:, :, ::1])",
-    writes=("templates",),
-)
-def sample(
-    image: Image,
-    centres: Array,
-    points: Array,
-    normals: Array,
-    T_curr_ref: Array,
-    height_m: float,
-    shift: Array,
-    focal_px: float,
-    templates: Floats,
-) -> None:
+@compiled("(u1[:, ::1], f8[:, ::1], f8[:, :, :, ::1], i8[::1], f4[:, :, ::1])", writes=("templates",))
+def sample(image: Image, centres: Array, powers: Array, reaches: Indices, templates: Floats) -> None:
     """Write the templates (N, T, T) of patches of an image.
 
-    centres (N, 2) [px] in the image; points (N, 3) [m] there on planes with normals (N, 3) [1/m]; T_curr_ref
-    (N, 4, 4); height_m: of the current viewpoint above the lower one; shift (N, 2) [px] of the templates' middle pixels
-    from the centres in the current panorama.
+    centres (N, 2) [px] in the image; powers (N, 2, 3, 3): polynomials of row and column from a template's middle, which
+    say how many columns and rows from the centre its pixels are; reaches (N,) [px]: none is farther; -1: unknown.
     """
     side, half = templates.shape[1], templates.shape[1] // 2
-    reach = 4 * side + 8  # of a template, and of the cubic kernel
-    cell, part = np.empty((reach, reach), np.float32), np.empty(4, np.float32)
-    columns, rows = np.empty((3, 3)), np.empty((3, 3))
+    most = 2 * reaches.max() + 5 if len(reaches) else 0
+    cell, part = np.empty((most, most), np.float32), np.empty(4, np.float32)
     for n in range(len(templates)):
-        # A place that is NaN or outside has no template.
-        is_near = 0 <= centres[n, 0] < image.shape[1] and 0 <= centres[n, 1] < image.shape[0]
-        if not (is_near and abs(shift[n, 0]) <= 1 and abs(shift[n, 1]) <= 1):
+        # A place that is unknown or outside has no template.
+        is_inside = 0 <= centres[n, 0] < image.shape[1] and 0 <= centres[n, 1] < image.shape[0]
+        if reaches[n] < 0 or not is_inside:
             templates[n] = 0.0
             continue
-        # 1. The pixels that the template reaches.
-        write_nodes(points[n], normals[n], T_curr_ref[n], height_m, shift[n], half, focal_px, columns, rows)
-        left, right = math.floor(centres[n, 0] + columns.min()) - 2, math.floor(centres[n, 0] + columns.max()) + 4
-        top, bottom = math.floor(centres[n, 1] + rows.min()) - 2, math.floor(centres[n, 1] + rows.max()) + 4
-        copy_cell(image, left, top, right - left, bottom - top, cell)
-        # 2. The places of the template's pixels in between, by the quadratic polynomials through the nodes.
-        write_coefficients(columns, half)
-        write_coefficients(rows, half)
+        # 1. The pixels that the template and the cubic kernel reach.
+        reach, width = reaches[n] + 1, 2 * reaches[n] + 5
+        columns, rows = powers[n, 0], powers[n, 1]
+        left, top = math.floor(centres[n, 0]) - reach, math.floor(centres[n, 1]) - reach
+        copy_cell(image, left, top, width, width, cell)
+        # 2. The places of the template's pixels in between.
         for i in range(side):
             t = float(i - half)
             x0 = np.float32(centres[n, 0] - left + columns[0, 0] + t * (columns[1, 0] + t * columns[2, 0]))
@@ -89,70 +73,6 @@ def sample(
                     part[m] = a * above[k + m] + b * here[k + m] + c * below[k + m] + d * last[k + m]
                 a, b, c, d = keys(x - np.float32(column))
                 templates[n, i, j] = (a * part[0] + b * part[1]) + (c * part[2] + d * part[3])
-
-
-@inner
-def write_nodes(
-    point: Array,
-    normal: Array,
-    T_curr_ref: Array,
-    height_m: float,
-    shift: Array,
-    half: int,
-    focal_px: float,
-    columns: Array,
-    rows: Array,
-) -> None:
-    """Write where the image shows corners, middles of the sides and middle of a template (3, 3), as offsets [px].
-
-    A template of which the plane explains a part alone is not bent.
-    """
-    R, limit = T_curr_ref[:3, :3], 4 * half + 2
-    # 1. The plane n' . (p' - o') = scale, and the point, from the current viewpoint o'.
-    n, seen, t = np.empty(3), np.empty(3), np.empty(3)
-    for a in range(3):
-        t[a] = T_curr_ref[a, 3] - (height_m if a == 2 else 0.0)
-        n[a] = R[a, 0] * normal[0] + R[a, 1] * normal[1] + R[a, 2] * normal[2]
-        seen[a] = R[a, 0] * point[0] + R[a, 1] * point[1] + R[a, 2] * point[2] + t[a]
-    scale = 1 + n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
-    r, seen_r = math.hypot(point[0], point[1]), math.hypot(seen[0], seen[1])
-    is_bent = scale > 0
-    for i in range(3):
-        z = seen[2] / seen_r - ((i - 1) * half + shift[1]) / focal_px
-        for j in range(3):
-            # 2. The ray of the pixel, of horizontal length 1; azimuth falls from column to column.
-            azimuth = -((j - 1) * half + shift[0]) / focal_px
-            c, s = math.cos(azimuth) / seen_r, math.sin(azimuth) / seen_r
-            x, y = c * seen[0] - s * seen[1], s * seen[0] + c * seen[1]
-            # 3. Its point on the plane, in the frame of the image, with the azimuth of the patch as x axis.
-            along = n[0] * x + n[1] * y + n[2] * z
-            is_bent &= along > 0
-            per = scale / along
-            x, y, up = x * per - t[0], y * per - t[1], z * per - t[2]
-            p = R[0, 0] * x + R[1, 0] * y + R[2, 0] * up
-            q = R[0, 1] * x + R[1, 1] * y + R[2, 1] * up
-            ahead, aside = (point[0] * p + point[1] * q) / r, (point[0] * q - point[1] * p) / r
-            high = R[0, 2] * x + R[1, 2] * y + R[2, 2] * up
-            columns[i, j] = -focal_px * math.atan2(aside, ahead)
-            rows[i, j] = focal_px * (point[2] / r - high / math.hypot(ahead, aside))
-            is_bent &= (ahead > 0) & (abs(columns[i, j]) < limit) & (abs(rows[i, j]) < limit)  # false for NaN
-    if not is_bent:
-        for i in range(3):
-            for j in range(3):
-                columns[i, j], rows[i, j] = (j - 1) * half + shift[0], (i - 1) * half + shift[1]
-
-
-@inner
-def write_coefficients(nodes: Array, half: int) -> None:
-    """Replace values at nodes (3, 3) of a square by the coefficients of powers (row, column) from its middle."""
-    for k in range(3):
-        first, middle, last = nodes[k, 0], nodes[k, 1], nodes[k, 2]
-        nodes[k, 0], nodes[k, 1] = middle, (last - first) / (2 * half)
-        nodes[k, 2] = (first - 2 * middle + last) / (2 * half**2)
-    for k in range(3):
-        first, middle, last = nodes[0, k], nodes[1, k], nodes[2, k]
-        nodes[0, k], nodes[1, k] = middle, (last - first) / (2 * half)
-        nodes[2, k] = (first - 2 * middle + last) / (2 * half**2)
 
 
 @inner

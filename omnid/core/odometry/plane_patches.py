@@ -53,33 +53,66 @@ class AlignedPatches:
     found: Flags  # (N,) textured, and near the prediction
 
 
-def plane_templates(
-    image: PaddedPanorama,
-    pixels: Array,
+def plane_templates(image: PaddedPanorama, pixels: Array, maps: Array, window_px: int = WINDOW_PX) -> Floats:
+    """Return templates (N, T, T) of patches at pixels (N, 2) of an image, less grey 128, by their plane_maps.
+
+    They hold the window and the border that the gradient's 3x3 operator needs.
+    """
+    templates, half = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32), window_px // 2 + 1
+    terms = np.abs(maps) * float(half) ** np.add.outer(np.arange(3), np.arange(3))
+    reaches = np.nan_to_num(np.ceil(terms.sum(axis=(2, 3)).max(axis=1)), nan=-1.0).astype(np.intp)
+    patch_kernels.sample(image.image, padded(image, pixels), maps, reaches, templates)
+    return templates
+
+
+def plane_maps(
     surfaces: tuple[Array, Array],
     T_curr_ref: Array,
-    model: StereoModel,
     predicted: Array,
+    model: StereoModel,
     *,
     upper: bool = False,
     window_px: int = WINDOW_PX,
-) -> Floats:
-    """Return templates (N, T, T) of patches at pixels (N, 2) of an image as the current view shows them, less grey 128.
+) -> Array:
+    """Return where an image shows the pixels of N templates, as the current view shows its planes: (N, 2, 3, 3).
 
-    They hold the window and the border that the gradient's 3x3 operator needs.
+    Polynomials of row and column from a template's middle give columns and rows from the patch's centre in the image.
 
     surfaces: points (N, 3) [m] at the patches' centres and slopes (N, 2) of the disparity there, both in the rectified
     frame of the image; T_curr_ref (N, 4, 4) from it. upper: the current panorama is the upper one. The templates'
     pixels are whole pixels of the current panorama, which shows the centres at predicted (N, 2). Where a plane is seen
-    edge on, the patch is not bent.
+    edge on, or explains a part alone, the patch is not bent.
     """
-    templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
-    points, normals = np.ascontiguousarray(surfaces[0]), _normals(surfaces, model.baseline_m)
-    shift = np.ascontiguousarray(np.rint(predicted) - predicted)
-    height_m, focal_px = model.baseline_m if upper else 0.0, model.cylinder.focal_px
-    at = image.image, padded(image, pixels)
-    patch_kernels.sample(*at, points, normals, T_curr_ref, height_m, shift, focal_px, templates)
-    return templates
+    # 1. The plane n' . (p' - o') = scale, and the points, from the current viewpoint o'.
+    (points, _), focal_px = surfaces, model.cylinder.focal_px
+    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3] - (0.0, 0.0, model.baseline_m if upper else 0.0)
+    n = np.einsum("nij,nj->ni", R, _normals(surfaces, model.baseline_m))
+    seen = np.einsum("nij,nj->ni", R, points) + t
+    scale, r, seen_r = 1 + (n * t).sum(axis=1), np.hypot(*points[:, :2].T), np.hypot(*seen[:, :2].T)
+    # 2. The rays of corners, middles of the sides and middle, of horizontal length 1; azimuth falls with the column.
+    half, shift = window_px // 2 + 1, np.rint(predicted) - predicted
+    at = half * np.arange(-1.0, 2.0)
+    offsets = at + shift[:, :, None]
+    azimuth = np.arctan2(seen[:, 1], seen[:, 0])[:, None] - offsets[:, 0] / focal_px
+    rays = np.empty((len(points), 3, 3, 3))
+    rays[..., 0], rays[..., 1] = np.cos(azimuth)[:, None], np.sin(azimuth)[:, None]
+    rays[..., 2] = ((seen[:, 2] / seen_r)[:, None] - offsets[:, 1] / focal_px)[:, :, None]
+    # 3. Their points on the plane, in the frame of the image, with the azimuth of the patch as x axis.
+    along = np.einsum("nijk,nk->nij", rays, n)
+    rays *= (scale[:, None, None] / along)[..., None]
+    rays -= t[:, None, None]
+    x, y = (points[:, :2] / r[:, None]).T[:, :, None]
+    axes = R[:, :, 0] * x + R[:, :, 1] * y, R[:, :, 1] * x - R[:, :, 0] * y, R[:, :, 2]
+    ahead, aside, high = (np.einsum("nijk,nk->nij", rays, axis) for axis in axes)
+    nodes = np.empty((len(points), 2, 3, 3))
+    nodes[:, 0] = -focal_px * np.arctan2(aside, ahead)
+    nodes[:, 1] = focal_px * ((points[:, 2] / r)[:, None, None] - high / np.hypot(ahead, aside))
+    is_bent = (along > 0) & (ahead > 0) & (np.abs(nodes) < 4 * half + 2).all(axis=1)
+    is_flat = ~(is_bent.all(axis=(1, 2)) & (scale > 0))
+    nodes[is_flat, 0], nodes[is_flat, 1] = offsets[is_flat, 0][:, None], offsets[is_flat, 1][:, :, None]
+    # 4. Between them quadratic polynomials.
+    to_powers = np.linalg.inv(np.vander(at, increasing=True))
+    return np.asarray(nodes.reshape(-1, 9) @ np.kron(to_powers, to_powers).T).reshape(nodes.shape)
 
 
 def _normals(surfaces: tuple[Array, Array], baseline_m: float) -> Array:
@@ -161,7 +194,8 @@ def _in_upper(
     """Return templates of the lower panorama's patches at pixels (N, 2) as the upper one shows them at predicted."""
     points = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
     surfaces, identity = (points, slopes), np.tile(np.eye(4), (len(pixels), 1, 1))
-    return plane_templates(pair[0], pixels, surfaces, identity, model, predicted, upper=True, window_px=window_px)
+    maps = plane_maps(surfaces, identity, predicted, model, upper=True, window_px=window_px)
+    return plane_templates(pair[0], pixels, maps, window_px)
 
 
 def align(

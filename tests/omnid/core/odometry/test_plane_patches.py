@@ -11,6 +11,7 @@ from calib.panorama import Cylinder
 from omnid.core.odometry.plane_patches import (
     align,
     fitted_slopes,
+    plane_maps,
     plane_templates,
 )
 from omnid.core.stereo.triangulation import view
@@ -79,7 +80,7 @@ def seen_at(points: Array, upper: bool) -> Array:
 
 def templates_of(surfaces: tuple[Array, Array], pixels: Array, seen: Array, *, upper: bool) -> NDArray[np.float32]:
     T = np.tile(T_CURR_REF, (len(pixels), 1, 1))
-    return 128 + plane_templates(panorama(np.eye(4)), pixels, surfaces, T, MODEL, seen, upper=upper)
+    return 128 + plane_templates(panorama(np.eye(4)), pixels, plane_maps(surfaces, T, seen, MODEL, upper=upper))
 
 
 @pytest.mark.parametrize("upper", [False, True])
