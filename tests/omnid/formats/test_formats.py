@@ -181,7 +181,9 @@ def test_the_floor_below_cameras_of_known_height_is_not_drawn(height_m: float, i
     assert (area(plan_view(points(box(0, 0, floor_m + 0.25)), NO_PATH, heights_m=heights_m)) < 200).any()
 
 
+@pytest.mark.slow
 def test_a_path_that_jumps_everywhere_is_drawn() -> None:
+    """From some 90,000 points on agg refuses it in one piece."""
     wrong = np.random.default_rng(1).uniform(-1e9, 1e9, (100_000, 2))
     assert plan_view(points(box(0, 0)), wrong, heights_m=drawn_heights(0.0)).max(axis=(0, 1)).tolist() == [255] * 3
 
