@@ -2,7 +2,8 @@
 
 Each folder holds log.mcap, truth.txt and a rig.toml or camchain.yaml, as `python -m tests.simulation` writes them.
 With --cloud the points of `omnid replay --cloud` are compared with the surfaces of the world, too: a folder is then
-named RECIPE_sSEED. A cell of 10 cm is seen if a point within 10 cm of a surface lies in it.
+named RECIPE_sSEED. A cell of 10 cm is seen if a point within 10 cm of a surface lies in it. --fit-body: the truth is of
+a body at the same place with other axes, as an IMU may have.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.status import summary_entries
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.recordings.evaluation import evaluate
+from omnid.recordings.evaluation import body_rotation, evaluate
 from tests.bench.paper.measures import surface_distance_m
 from tests.bench.results import Cell, ResultTable, columns, family_and_seed, run
 from tests.simulation.recipes import build
@@ -43,11 +44,13 @@ OF_POSES = (
 OF_CLOUD = ("points of the cloud", "their error p50|cm|2", "p90|cm|2", f"beyond {FAR_M} m|%|2", "cells seen")
 
 
-def row(folder: Path, overrides: Sequence[str], *, cloud: bool = False) -> list[Cell]:
+def row(folder: Path, overrides: Sequence[str], *, cloud: bool = False, fit_body: bool = False) -> list[Cell]:
     """Return one row of the table: the errors of one log, the shares of its states, and the errors of its cloud."""
     result = omnid.replay(folder / "log.mcap", rig_of(folder), overrides=overrides)
-    truth = read_tum(folder / "truth.txt")
-    m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), truth)
+    truth, estimate = read_tum(folder / "truth.txt"), Trajectory(result.stamps_ns, result.T_odom_rig)
+    if fit_body:
+        truth = Trajectory(truth.stamps_ns, truth.T @ se3.inverse(body_rotation(estimate, truth)))
+    m = evaluate(estimate, truth)
     return [
         folder.name,
         m.pairs,
@@ -106,12 +109,12 @@ def rig_of(folder: Path) -> Rig:
         return read_rig(path)
 
 
-def accuracy(folders: Sequence[Path], *, set_: Sequence[str] = (), cloud: bool = False) -> None:
+def accuracy(folders: Sequence[Path], *, set_: Sequence[str] = (), cloud: bool = False, fit_body: bool = False) -> None:
     """Print the table, each row as soon as it is measured."""
     title = f"Rendered logs, {' '.join(set_) or 'default settings'}"
     table = ResultTable("accuracy", title, columns(*OF_POSES, "states", *OF_CLOUD * cloud))
     for folder in folders:
-        table.add(*row(folder, set_, cloud=cloud), folder=folder)
+        table.add(*row(folder, set_, cloud=cloud, fit_body=fit_body), folder=folder)
 
 
 if __name__ == "__main__":

@@ -80,18 +80,16 @@ def consensus(a: Array, b: Array, agree: Callable[[Array], Flags], rng: np.rando
     Others are drawn in batches until three inliers have almost certainly been among them, also where most agree with
     the first: a few that are near tell a turn from a step aside, and the others agree with both.
     """
-    usable, motions = np.flatnonzero(np.isfinite(b).all(axis=1)), np.eye(4)[None]
-    best, chosen = motions[0], np.zeros(len(a), bool)
-    for drawn in range(0, RANSAC_MOST + 1, RANSAC_BATCH):
-        if drawn:
-            triples = usable[rng.random((RANSAC_BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
-            motions = rigid_fit(a[triples], b[triples])
+    usable, best = np.flatnonzero(np.isfinite(b).all(axis=1)), np.eye(4)
+    if len(usable) < 3:
+        return best, agree(best[None])[0]
+    for drawn in range(RANSAC_BATCH, RANSAC_MOST + 1, RANSAC_BATCH):
+        triples = usable[rng.random((RANSAC_BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
+        motions = np.concatenate([best[None], rigid_fit(a[triples], b[triples])])
         agreeing = agree(motions)
         most = int(agreeing.sum(axis=1).argmax())
-        if agreeing[most].sum() > chosen.sum():
-            best, chosen = motions[most], agreeing[most]
-        share = float(chosen.mean()) if len(chosen) else 0.0
-        if len(usable) < 3 or (1 - share**3) ** drawn < RANSAC_MISSED:
+        best, chosen = motions[most], agreeing[most]
+        if (1 - float(chosen.mean()) ** 3) ** drawn < RANSAC_MISSED:
             break
     return best, chosen
 
