@@ -147,8 +147,9 @@ def gauss_newton(
         informed = np.einsum("nij,nj->ni", information, e)
         squared = (e * informed).sum(axis=1)
         weight = 1 / (1 + squared / KERNEL_WIDTH**2)
-        if number >= OUTLIER_STEPS:
-            weight = np.where(squared < OUTLIER_SQUARED, weight, 0.0)
+        is_right = squared < OUTLIER_SQUARED
+        if number >= OUTLIER_STEPS and is_right.sum() >= POSE:  # fewer leave the equations singular
+            weight = np.where(is_right, weight, 0.0)
         weighted = J * weight[:, None, None]
         H = prior + np.tensordot(weighted, information @ J, axes=((0, 1), (0, 1)))
         g = np.tensordot(weighted, informed, axes=((0, 1), (0, 1))) - prior[:, POSE:] @ error

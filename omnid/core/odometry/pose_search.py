@@ -228,6 +228,8 @@ class PoseSearch:
         shared: tuple[Array, Array] | None = None,
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton, and flags (M,) of the inliers; None where they are too few."""
+        if len(landmarks) < MIN_LANDMARKS:
+            return None, np.zeros(len(landmarks), bool)
         points, covariance = self._map.table.points[landmarks], self._map.table.covariance[landmarks]
         solution = gauss_newton(points, covariance, views, T_curr_odom, model, noise, shared=shared)
         kept = solution.squared < OUTLIER_SQUARED

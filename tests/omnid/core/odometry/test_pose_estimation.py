@@ -55,6 +55,17 @@ def test_the_covariance_matches_the_scatter() -> None:
     assert spread.min() > 0.7 and spread.max() < 1.3
 
 
+@pytest.mark.parametrize("right", [0, 1, 2])
+def test_views_that_agree_with_no_motion_give_none_and_no_error(right: int) -> None:
+    """Where all but so few of the views are outliers the equations have no other solution."""
+    points, rng = landmarks(30), np.random.default_rng(5)
+    covariance = point_covariance(points, MODEL.cylinder, MODEL.baseline_m, MODEL.sigma_px)
+    views = views_of(points)
+    views[right:] += rng.choice([-1, 1], (30 - right, 3)) * rng.uniform(30, 60, (30 - right, 3))
+    found = gauss_newton(points, 1e-6 * covariance, views, MOTION, replace(MODEL, sigma_px=0.02))
+    assert np.isfinite(found.covariance).all() and (found.squared < 16).sum() < 6
+
+
 def test_a_few_near_landmarks_tell_a_step_aside_from_a_turn() -> None:
     """As before a wall, where the others agree with both, and with no motion as well, within the noise of tracks."""
     rng = np.random.default_rng(1)
