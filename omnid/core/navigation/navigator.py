@@ -40,7 +40,6 @@ REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a 
 AGAIN_NS, SHORTER_NS = 500_000_000, 2_000_000_000
 DOCK_M: Final = 0.5  # The last way to a goal is driven straight on.
 BETTER: Final = 0.8  # A way replaces one that is free only if it takes less than this share of its time.
-MOST_WAYS: Final = 6  # Most ways that are tried without coming NEARER_M nearer to the end.
 LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
 NEARER_M: Final = 1.0  # After this progress the next block is a new one.
 
@@ -82,7 +81,6 @@ class Drive:
     lost_s: float = 0.0  # time for which no way was free, since least_m fell
     tried_s: float = 0.0  # time on ways that were blocked again, since least_m fell
     way_s: float = 0.0  # time on the present way
-    ways: int = 0  # number of ways that were tried since least_m fell
     searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why the last search found no way
     move: Move | None = None  # kind of the newest motion that was wanted
@@ -250,7 +248,7 @@ class Navigator:
                 f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again",
             )
         if following.left_m < drive.least_m - NEARER_M:
-            drive.least_m, drive.ways, drive.lost_s, drive.tried_s = following.left_m, 0, 0.0, 0.0
+            drive.least_m, drive.lost_s, drive.tried_s = following.left_m, 0.0, 0.0
         # 3. Obstacles on the way, and a safety rule that stops the wheels because of an obstacle.
         following, obstacle = self._around_obstacles(drive, now, following)
         if obstacle or now.wheels.blocked_by:  # Stopped wheels still get the motion: the monitor releases them.
@@ -344,11 +342,10 @@ class Navigator:
             return False
         drive.searched_ns, drive.is_waiting = now.stamp_ns, False
         if is_blocked and detour is not None:
-            drive.ways += drive.way_s * 1e9 > AGAIN_NS  # what was not driven was not tried
             drive.tried_s, drive.way_s = drive.tried_s + drive.way_s, 0.0
         found = self._search(drive, now, around, drive.move if now.wheels.blocked_by else None)
-        if not isinstance(found, str) and is_blocked and drive.ways >= MOST_WAYS:
-            found = f"{drive.ways} ways were tried"
+        if not isinstance(found, str) and is_blocked and 0 < settings.give_up_s < drive.lost_s + drive.tried_s:
+            found = f"ways of {drive.tried_s:.0f} s led no nearer"
         if isinstance(found, str):
             drive.no_way = found
             return False
