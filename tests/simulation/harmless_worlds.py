@@ -187,6 +187,15 @@ def _person_passes(b: Builder) -> Trial:
     return Trial(built(b, people=(Person(b.adult(), Walker(path, b.rng.uniform(0.9, 1.2), start_s=3.0)),)))
 
 
+def _person_comes(b: Builder) -> Trial:
+    """Somebody comes up to the robot, stands before it for some seconds, from foot to foot, and goes back."""
+    _, high = corridor(b, width_m=2.0, length_m=20.0)
+    at_m = b.rng.uniform(1.4, 1.6)
+    stands = ((at_m + 0.02 * (k % 2), 0.0) for k in range(180))
+    path = ((5.0, 0.0), *stands, (high[0] - 1.2, 0.0))
+    return Trial(built(b, people=(Person(b.adult(), Walker(path, 0.9, start_s=1.0)),)))
+
+
 # To a goal
 
 
@@ -297,6 +306,7 @@ MAKERS: Final[Makers] = {
     "dark_and_on": (None, lambda b: _lights(b, (8.0, 0.004), (11.0, 1.0))),
     "trolley_leaves": (None, _trolley_leaves),
     "person_passes": (None, _person_passes),
+    "person_comes": (None, _person_comes),
     "door_80(_aslant|)": (None, _door),
     "office": (None, _office),
     "clutter": (None, _clutter),
@@ -307,6 +317,6 @@ NAMES: Final = (
     *FLOORS,
     *(f"{name}_hall" for name in FLOORS),
     *("ramp_2", "ramp_5", "ramp_8", "lift_gap", "sun_moving", "light_switch", "dark_and_on"),
-    *("trolley_leaves", "person_passes", "narrow"),
+    *("trolley_leaves", "person_passes", "person_comes", "narrow"),
     *("door_80", "door_80_aslant", "office", "clutter", "dead_end_and_back", "doorway_with_person"),  # to a goal
 )
