@@ -197,8 +197,9 @@ class RayScans:
             self._observe_tilt(pose, pair, start_m, way_rad)
         if is_due:
             self._followed_ns = stamp_ns
-        # A rig that leans shows a slope everywhere.
-        if is_due and np.diag(self._P).max() < SURE_RAD**2 and start_m > FOUND_M:
+        # A rig that leans along the way shows a slope everywhere on it.
+        ahead = np.array([math.cos(viewpoint[2] + turn_rad), math.sin(viewpoint[2] + turn_rad)])
+        if is_due and ahead @ self._P @ ahead < SURE_RAD**2 and start_m > FOUND_M:
             found = ramp_ahead(pair, self._floor, viewpoint, turn_rad, float(T_odom_base[2, 0]))
             # A nearer pair shows it better.
             if found is not None and (ramp is None or found.nats > ramp.nats):
