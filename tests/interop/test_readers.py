@@ -1,4 +1,4 @@
-"""Recordings, read by programs of other projects: @mcap/core under node, evo; README.md names their versions."""
+"""Recordings, read by programs of other projects: @mcap/core under node, evo."""
 
 from __future__ import annotations
 
