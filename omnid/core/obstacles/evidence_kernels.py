@@ -64,14 +64,23 @@ def bounded_band_pass(smooth: Floats, rows: int, most: np.float32, band: Floats)
 
 
 @inner
-def add_differences(lower: Bytes, least: Bytes, most: Bytes, live: Bytes, sums: Words, into: Words) -> None:
-    """Write sums (W,) and by how much a row lies outside of the bounds of another one, where it is live (255, else 0),
-    at most an outlier's."""
-    for u in range(len(into)):
-        above = np.uint8(lower[u] - most[u]) if lower[u] > most[u] else np.uint8(0)
-        below = np.uint8(least[u] - lower[u]) if least[u] > lower[u] else np.uint8(0)
-        found = above | below
-        into[u] = np.uint16(sums[u] + np.uint16(np.uint8((found if found < OUTLIER else OUTLIER) & live[u])))
+def sum_differences(
+    lower: Bytes, bounds: Bytes, live: Bytes, first: int, end: int, disparity: int, into: Words
+) -> None:
+    """Write the sums (W,) of the differences of rows from a first one to an end at a disparity: by how much a pixel
+    lies outside of its bounds, at most an outlier's.
+
+    lower (H, W): normalised panorama; bounds (2, H, W): least and most of the upper one about each pixel; live (H, W):
+    255 where pixels may be compared, else 0.
+    """
+    into[:] = NOTHING
+    for v in range(first, end):
+        mine, may, least, most = lower[v], live[v], bounds[0, v + disparity], bounds[1, v + disparity]
+        for u in range(len(into)):
+            above = np.uint8(mine[u] - most[u]) if mine[u] > most[u] else np.uint8(0)
+            below = np.uint8(least[u] - mine[u]) if least[u] > mine[u] else np.uint8(0)
+            found = above | below
+            into[u] += np.uint8((found if found < OUTLIER else OUTLIER) & may[u])
 
 
 @inner
@@ -101,16 +110,15 @@ def spread(sums: Words, into: Words) -> None:
 
 
 @inner
-def subtract_together(sums: Words, before: Words, count: int, into: Words) -> None:
-    """Write the differences (W,) of sums and sums before of each direction and of those that follow it, so many
-    together."""
+def add_together(sums: Words, count: int, into: Words) -> None:
+    """Write the sums (W,) of each direction and of those that follow it, so many together."""
     width = len(sums)
-    into[:] = NOTHING
-    for m in range(count):
+    into[:] = sums
+    for m in range(1, count):
         for u in range(width - m):
-            into[u] = np.uint16(into[u] + np.uint16(sums[u + m] - before[u + m]))
+            into[u] += sums[u + m]
         for u in range(width - m, width):
-            into[u] = np.uint16(into[u] + np.uint16(sums[u + m - width] - before[u + m - width]))
+            into[u] += sums[u + m - width]
 
 
 @inner
@@ -120,22 +128,8 @@ def lower_to(values: Words, into: Words) -> None:
         into[u] = values[u] if values[u] < into[u] else into[u]
 
 
-@compiled("(u1[:, ::1], u1[:, :, ::1], u1[:, ::1], i8, u2[:, :, ::1])", writes=("sums",))
-def sum_differences(lower: Bytes, bounds: Bytes, live: Bytes, first: int, sums: Words) -> None:
-    """Write the sums (D, H + 1, W), modulo 2^16, of the differences at D disparities from a first row to each row.
-
-    lower (H, W): normalised panorama; bounds (2, H, W): least and most of the upper one about each pixel; live (H, W):
-    255 where pixels may be compared, else 0.
-    """
-    height = len(lower)
-    for d in range(len(sums)):
-        sums[d, first] = NOTHING
-        for v in range(first, height - d):
-            add_differences(lower[v], bounds[0, v + d], bounds[1, v + d], live[v], sums[d, v], sums[d, v + 1])
-
-
 @compiled(
-    "(u1[:, ::1], u1[:, ::1], u1[:, ::1], u2[:, :, ::1], u2[:, ::1], f4[::1], i4[:, ::1], f4[:, :, ::1],"
+    "(u1[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], f4[::1], i4[:, ::1], f4[:, :, ::1],"
     " f4[:, ::1], f4[:, :, ::1])",
     writes=("others", "level"),
 )
@@ -143,8 +137,8 @@ def floor_evidence(
     lower: Bytes,
     upper: Bytes,
     live: Bytes,
-    upright_sums: Words,
-    plane_sums: Words,
+    bounds: Bytes,
+    on_plane: Bytes,
     plane_rows: Floats,
     patches: Numbers,
     offsets: Floats,
@@ -157,9 +151,9 @@ def floor_evidence(
     Where one of many deeper patches fits as well as the floor there is no evidence for it: a floor that repeats itself,
     and falls deep at an edge, fits at some range by another period. Against it counts what is beyond the fit of noise.
 
-    lower, upper (H, W): normalised panoramas. live (H, W): 255 where pixels may be compared, else 0. upright_sums (D,
-    H + 1, W), plane_sums (H + 1, W): of sum_differences, by disparity and on the plane of the floor. plane_rows (H,):
-    row of the upper one that shows the floor of a row.
+    lower, upper (H, W): normalised panoramas. live (H, W): 255 where pixels may be compared, else 0. bounds (2, H, W):
+    of the upper one, as of sum_differences; on_plane: those of what it shows on the plane of the floor. plane_rows
+    (H,): row of the upper one that shows the floor of a row.
     patches (K, 7): first row and end of the rows of the floor at that disparity, 0 and 0 for none; of the disparities
     the first, the last that is lower than the floor, the first that is higher, and the end; the directions that
     something thin hides: their mean is compared, of a direction and those that follow it.
@@ -177,13 +171,15 @@ def floor_evidence(
         # 1. Upright things at other disparities, of single thin ones.
         together = patches[k, PATCH_THIN]
         others[k], weights = NOTHING, NOTHING
-        subtract_together(plane_sums[end], plane_sums[first], together, floor)
+        sum_differences(lower, on_plane, live, first, end, 0, sums)
+        add_together(sums, together, floor)
         for d in range(patches[k, PATCH_FROM], patches[k, PATCH_TO]):
             if d <= patches[k, PATCH_LOW] or d >= patches[k, PATCH_HIGH]:
-                subtract_together(upright_sums[d, end], upright_sums[d, first], together, sums)
+                sum_differences(lower, bounds, live, first, end, d, sums)
+                add_together(sums, together, next_sums)
                 scale = DIFFERENCE_SCALE / np.float32(together)
                 prior = np.float32(math.exp(-abs(d - k) / ADJACENT_PX)) + DISTANT_SHARE
-                add_likelihoods(sums, floor, scale, prior, value, others[k])
+                add_likelihoods(next_sums, floor, scale, prior, value, others[k])
                 weights += prior
         others[k] /= weights
         # 2. Planes, in rows between two of the upper panorama.
@@ -244,31 +240,40 @@ def add_run(
         best[u] = value if value > best[u] else best[u]
 
 
-@compiled("(u2[:, :, ::1], u2[:, ::1], i4[:, ::1], f4[:, ::1])", writes=("surface",))
-def surface_evidence(upright_sums: Words, plane_sums: Words, strips: Numbers, surface: Floats) -> None:
+@compiled("(u1[:, ::1], u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], i4[:, ::1], f4[:, ::1])", writes=("surface",))
+def surface_evidence(
+    lower: Bytes, live: Bytes, bounds: Bytes, on_plane: Bytes, strips: Numbers, surface: Floats
+) -> None:
     """Write the best run (K, W) of strips of rows that are a surface, as a log-likelihood ratio.
 
-    Sums as for floor_evidence. strips (N, 6), from above: first row and end; first disparity that is a surface within
-    the robot's heights, and end of the disparities, which never rises; 1 where the floor is an explanation, too; end of
-    the disparities that lie below the floor.
+    Panoramas as for floor_evidence. strips (N, 6), from above, each with the second half of the one before: first row
+    and end; first disparity that is a surface within the robot's heights, and end of the disparities, which never
+    rises; 1 where the floor is an explanation, too; end of the disparities that lie below the floor.
     """
     bins, width = surface.shape
-    sums, floor, best = np.empty((bins, width), np.uint16), np.empty(width, np.uint16), np.empty(width, np.uint16)
+    sums, second = np.empty((bins, width), np.uint16), np.zeros((bins, width), np.uint16)
+    floor, best = np.empty(width, np.uint16), np.empty(width, np.uint16)
     value, total = np.zeros((bins + 2, width), np.float32), np.empty(width, np.float32)
     run, plain = np.zeros((bins, width), np.float32), np.empty(width, np.float32)
     surface[:] = NOTHING
     for n in range(len(strips)):
         first, end = strips[n, STRIP_FIRST], strips[n, STRIP_END]
         mine, last, below = strips[n, STRIP_SURFACE], strips[n, STRIP_SHIFTS], strips[n, STRIP_BELOW]
+        middle = (first + end) // 2
         # 1. The differences, and the least of them.
         best[:], total[:], value[last + 1] = LARGEST, NOTHING, NOTHING
         for d in range(last):
-            subtract_together(upright_sums[d, end], upright_sums[d, first], 1, sums[d])
+            if n == 0:
+                sum_differences(lower, bounds, live, first, middle, d, second[d])
+            sums[d] = second[d]
+            sum_differences(lower, bounds, live, middle, end, d, second[d])
+            for u in range(width):
+                sums[d, u] += second[d, u]
             lower_to(sums[d], best)
         # 2. The likelihoods of the floor and of all disparities.
         weights = below * BELOW_WEIGHT + (last - below)
         if strips[n, STRIP_FLOOR] > 0:
-            subtract_together(plane_sums[end], plane_sums[first], 1, floor)
+            sum_differences(lower, on_plane, live, first, end, 0, floor)
             lower_to(floor, best)
             add_likelihoods(floor, best, DIFFERENCE_SCALE, FLOOR_WEIGHT, plain, total)
             weights += FLOOR_WEIGHT

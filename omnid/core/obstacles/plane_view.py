@@ -171,7 +171,6 @@ class PlaneView:
         share = self._visible[:, self._shown].mean(axis=1)
         first_row, self.last_row = _rows_in_use(share > (0.5 if bins is None else 0.0), round(self.row0))
         # 2. Stereo.
-        self._sums = np.empty((self.disparities, self.height + 1, DIRECTIONS), np.uint16)
         self._patches, self._offsets = self._made_patches()
         self._strips = self._made_strips(first_row)
         # 3. Bins, and the rows of both views that show them.
@@ -217,8 +216,8 @@ class PlaneView:
         # 2. Surfaces. They fit a little at the next disparities, too.
         live = pair.seen * np.uint8(255)
         surface = np.empty((self.disparities, DIRECTIONS), np.float32)
-        plane_sums = self._sum_differences(*pair.normalised(), live, 0)
-        kernels.surface_evidence(self._sums, plane_sums, self._strips, surface)
+        lower, upper = pair.normalised()
+        kernels.surface_evidence(lower, live, *self._bounds(upper), self._strips, surface)
         nearer, farther = (np.roll(surface, shift, axis=0) for shift in (-1, 1))
         surface = np.where((surface >= nearer) & (surface >= farther), surface, np.float32(0))
         # 3. A surface that fits best in the weighted mean of neighbours counts as one.
@@ -231,9 +230,8 @@ class PlaneView:
         # 4. The floor, and planes beside it.
         others, levels = np.empty_like(surface), np.empty((2, *surface.shape), np.float32)
         lower, upper = pair.normalised(BOUNDED_SIGMAS)
-        plane_sums, rows = self._sum_differences(lower, upper, live, max(int(self.row0) - BIN_ROWS, 0)), self.plane_rows
-        tables = self._patches, self._offsets
-        kernels.floor_evidence(lower, upper, live, self._sums, plane_sums, rows, *tables, others, levels)
+        bounds, rows = self._bounds(upper), self.plane_rows
+        kernels.floor_evidence(lower, upper, live, *bounds, rows, self._patches, self._offsets, others, levels)
         together = self._patches[:, kernels.PATCH_THIN, None].astype(np.float32)
         floor = -together * np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
         # 5. By bins. A surface that fits at a whole disparity is within half of one of it.
@@ -263,13 +261,9 @@ class PlaneView:
         sized = self._sized(flags * np.uint8(255))
         return sized if self._level_map is None else np.asarray(cv2.remap(sized, *self._level_map, cv2.INTER_LINEAR))
 
-    def _sum_differences(self, lower: Bytes, upper: Bytes, live: Bytes, first: int) -> NDArray[np.uint16]:
-        """Keep the sums of kernels.sum_differences of normalised panoramas at all disparities; return those on the
-        plane (H + 1, DIRECTIONS)."""
-        on_plane = np.empty((1, *self._sums.shape[1:]), np.uint16)
-        kernels.sum_differences(lower, _half_row_bounds(upper), live, first, self._sums)
-        kernels.sum_differences(lower, _half_row_bounds(_remapped(upper, self._plane_map)), live, first, on_plane)
-        return np.asarray(on_plane[0])
+    def _bounds(self, upper: Bytes) -> tuple[Bytes, Bytes]:
+        """Return the bounds (2, H, DIRECTIONS) of a normalised panorama, and of what it shows on the plane."""
+        return _half_row_bounds(upper), _half_row_bounds(_remapped(upper, self._plane_map))
 
     def _made_patches(self) -> tuple[Tables, Floats]:
         """Return the tables of patches and of planes of kernels.floor_evidence."""
