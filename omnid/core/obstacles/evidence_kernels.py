@@ -21,6 +21,8 @@ Numbers = NDArray[np.int32]
 LARGEST = np.uint16(np.iinfo(np.uint16).max)
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
 UNITS = 12.0  # levels of a normalised image in one sigma, because 8 bits hold ten sigmas either way
+MIDDLE, HIGHEST = np.float32(128.5), np.float32(255.0)
+ROW_PARTS = 32  # of a row, in which places between rows are given
 OUTLIER = np.uint8(4 * UNITS)  # Most units by which a pixel differs, because more than four sigmas are no noise.
 # Log-likelihood by a unit of difference of a direction: 1 by a sigma would be that of independent pixels; and of planes
 # beside the floor, which are compared in seven directions together, with weights of 64 in all.
@@ -45,14 +47,14 @@ PATCH_FIRST, PATCH_END, PATCH_FROM, PATCH_LOW, PATCH_HIGH, PATCH_TO, PATCH_THIN 
 STRIP_FIRST, STRIP_END, STRIP_SURFACE, STRIP_SHIFTS, STRIP_FLOOR, STRIP_BELOW = range(6)
 
 
-@compiled("(f4[:, ::1], i8, f4, f4[:, ::1])", writes=("band",))
-def bounded_band_pass(smooth: Floats, rows: int, most: np.float32, band: Floats) -> None:
-    """Write by how much the pixels of an image (H, W) exceed those of their column, in the mean of an odd number of
-    rows, of which each counts `most` at most: a strong edge hides no weak texture around it."""
+@compiled("(f4[:, ::1], i8, i8, f4, f4[:, ::1])", writes=("band",))
+def bounded_band_pass(smooth: Floats, first: int, rows: int, most: np.float32, band: Floats) -> None:
+    """Write by how much the pixels of an image (H, W) exceed those of their column, from a first row on, in the mean of
+    an odd number of rows, of which each counts `most` at most: a strong edge hides no weak texture around it."""
     last, half = len(smooth) - 1, rows // 2
     band[:] = NOTHING
-    for v in range(len(smooth)):
-        mine, into = smooth[v], band[v]
+    for v in range(first, len(smooth)):
+        mine, into = smooth[v], band[v - first]
         for at in range(v - half, v + half + 1):
             other = smooth[last - abs(last - abs(at))]  # mirrored at the borders
             for u in range(len(into)):
@@ -61,6 +63,41 @@ def bounded_band_pass(smooth: Floats, rows: int, most: np.float32, band: Floats)
                 into[u] += above if above > -most else -most
         for u in range(len(into)):
             into[u] /= np.float32(rows)
+
+
+@compiled("(f4[:, ::1], f4[:, ::1], f4, f4, u1[:, ::1])", writes=("levels",))
+def in_sigmas(band: Floats, contrast2: Floats, noise2: np.float32, share2: np.float32, levels: Bytes) -> None:
+    """Write a band (H, W) in sigmas about the middle of 8 bits, by the variance of noise and a share of contrast2."""
+    for v in range(len(band)):
+        for u in range(band.shape[1]):
+            level = np.float32(UNITS) * band[v, u] / math.sqrt(noise2 + share2 * contrast2[v, u]) + MIDDLE
+            level = level if level > NOTHING else NOTHING
+            levels[v, u] = np.uint8(level if level < HIGHEST else HIGHEST)
+
+
+@inner
+def half_way(one: int, other: int) -> np.uint8:
+    """Return the mean of two bytes, the even one of two that are as near."""
+    both = np.uint16(one) + np.uint16(other)
+    return np.uint8((both + ((both >> 1) & 1)) >> 1)
+
+
+@compiled("(u1[:, ::1], i4[::1], u1[:, :, ::1])", writes=("bounds",))
+def half_row_bounds(image: Bytes, rows: Numbers, bounds: Bytes) -> None:
+    """Write the least and the most (2, H, W) within half a row of each pixel of what an image (H, W) shows at rows
+    (H,), which are in parts of ROW_PARTS."""
+    last, shown = len(image) - 1, np.empty_like(image)
+    for v in range(last + 1):
+        above, share = image[min(rows[v] // ROW_PARTS, last)], np.uint16(rows[v] % ROW_PARTS)
+        below, rest = image[min(rows[v] // ROW_PARTS + 1, last)], np.uint16(ROW_PARTS - share)
+        for u in range(image.shape[1]):
+            shown[v, u] = (above[u] * rest + below[u] * share + np.uint16(ROW_PARTS // 2)) // np.uint16(ROW_PARTS)
+    for v in range(last + 1):
+        above, mine, below = shown[max(v - 1, 0)], shown[v], shown[min(v + 1, last)]
+        for u in range(image.shape[1]):
+            high, low = half_way(mine[u], above[u]), half_way(mine[u], below[u])
+            bounds[0, v, u] = min(mine[u], min(high, low))
+            bounds[1, v, u] = max(mine[u], max(high, low))
 
 
 @inner

@@ -13,7 +13,9 @@ logarithm of the ratio is 0. docs/obstacles.md has them. Bins of range are half 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, TypeVar
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,7 +26,6 @@ from calib import se3
 from calib.panorama import Cylinder
 from drivers.jpeg import coding_sigma
 from omnid.core.obstacles import evidence_kernels as kernels
-from omnid.core.obstacles.evidence_kernels import UNITS
 from omnid.core.obstacles.ray_kernels import PARAMETERS, THIN_M
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
@@ -88,29 +89,39 @@ class Bins(NamedTuple):
     ends_m: Array  # (N + 1,) at which they begin, and the end of the last
 
 
-class WorkingPair(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class WorkingPair:
     """A pair in the working size, with the floor's horizon level."""
 
     lower: Floats  # (H, DIRECTIONS) grey levels
     upper: Floats
     seen: Flags  # (H, DIRECTIONS) pixels that both cameras see, and that are evidence
+    floor_row: int  # first row that may show floor
     sensor_grey: float  # noise of the difference of two pixels, by the sensors,
     noise_grey: float  # and of smoothed ones, by sensors and JPEGs
 
-    def normalised(self, bounded_sigmas: float = math.inf) -> tuple[Bytes, Bytes]:
-        """Return by how much both panoramas exceed their columns around, in sigmas of the difference of views.
+    @cached_property
+    def normalised(self) -> tuple[Bytes, Bytes]:
+        """By how much both panoramas exceed their columns around, in sigmas of the difference of views.
 
-        bounded_sigmas: most that one row around counts. Levels are UNITS a sigma about the middle of 8 bits.
+        Levels are UNITS a sigma about the middle of 8 bits.
         """
-        found = []
-        for image in (self.lower, self.upper):
-            smooth = np.asarray(cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX), np.float32)
-            band = np.empty_like(smooth)
-            kernels.bounded_band_pass(smooth, AROUND_ROWS, np.float32(bounded_sigmas * self.noise_grey), band)
-            contrast2 = cv2.blur(band * band, (3, AROUND_ROWS))
-            sigma = np.sqrt(np.float32(self.noise_grey**2) + np.float32(TEXTURE_SHARE**2) * contrast2)
-            found.append(np.clip(np.float32(UNITS) * band / sigma + np.float32(128.5), 0.0, 255.0).astype(np.uint8))
-        return found[0], found[1]
+        return self._levels(self.lower, 0, math.inf), self._levels(self.upper, 0, math.inf)
+
+    @cached_property
+    def bounded(self) -> tuple[Bytes, Bytes]:
+        """The same in rows that may show floor, 0 above, where one row around counts BOUNDED_SIGMAS at most."""
+        first, most = max(self.floor_row - AROUND_ROWS, 0), BOUNDED_SIGMAS * self.noise_grey
+        return self._levels(self.lower, first, most), self._levels(self.upper, first, most)
+
+    def _levels(self, image: Floats, first: int, most: float) -> Bytes:
+        smooth = np.asarray(cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX), np.float32)
+        band, levels = np.empty_like(smooth[first:]), np.zeros(image.shape, np.uint8)
+        kernels.bounded_band_pass(smooth, first, AROUND_ROWS, np.float32(most), band)
+        contrast2 = np.asarray(cv2.blur(band * band, (3, AROUND_ROWS)), np.float32)
+        noise2, share2 = np.float32(self.noise_grey**2), np.float32(TEXTURE_SHARE**2)
+        kernels.in_sigmas(band, contrast2, noise2, share2, levels[first:])
+        return levels
 
 
 class ShownBins(NamedTuple):
@@ -165,8 +176,11 @@ class PlaneView:
         self.height = self._shown_rows + math.ceil(rise_px.max())
         rows = np.arange(self.height)
         self.plane_rows = (rows + self._floor_slope * np.maximum(rows - self.row0, 0.0)).astype(np.float32)
-        self._plane_map = _map_of(np.broadcast_to(self.plane_rows[:, None], (self.height, DIRECTIONS)))
-        self._level_map = _map_of(rows[:, None] - rise_px) if rise_px.any() else None
+        both_rows = np.stack([rows, self.plane_rows])
+        self._bound_rows = np.rint(kernels.ROW_PARTS * both_rows).astype(np.int32)
+        columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self.height, DIRECTIONS))
+        level_rows = (rows[:, None] - rise_px).astype(np.float32)
+        self._level_map = cv2.convertMaps(columns, level_rows, cv2.CV_16SC2) if rise_px.any() else None
         self._visible = self._mask(visible) > 127  # (H, DIRECTIONS)
         share = self._visible[:, self._shown].mean(axis=1)
         first_row, self.last_row = _rows_in_use(share > (0.5 if bins is None else 0.0), round(self.row0))
@@ -202,10 +216,13 @@ class PlaneView:
         both = lower, upper
         images = [self._sized(np.ascontiguousarray(one.panorama)).astype(np.float32) for one in both]
         if self._level_map is not None:
-            images = [_remapped(image, self._level_map) for image in images]
+            at = *self._level_map, cv2.INTER_LINEAR
+            remapped = (cv2.remap(image, *at, borderMode=cv2.BORDER_REPLICATE) for image in images)
+            images = [np.asarray(image, np.float32) for image in remapped]
         coding_grey = (one.gain * coding_sigma(one.jpeg_steps, self._coding_frequencies) for one in both)
         sensor_grey = math.hypot(lower.noise_grey, upper.noise_grey)
-        return WorkingPair(images[0], images[1], seen, sensor_grey, math.hypot(BAND_NOISE * sensor_grey, *coding_grey))
+        noise_grey = math.hypot(BAND_NOISE * sensor_grey, *coding_grey)
+        return WorkingPair(images[0], images[1], seen, max(int(self.row0) - BIN_ROWS - 1, 0), sensor_grey, noise_grey)
 
     def shown(self, pair: WorkingPair) -> ShownBins:
         """Return what a pair shows of the bins, by its greys and by stereo."""
@@ -216,7 +233,7 @@ class PlaneView:
         # 2. Surfaces. They fit a little at the next disparities, too.
         live = pair.seen * np.uint8(255)
         surface = np.empty((self.disparities, DIRECTIONS), np.float32)
-        lower, upper = pair.normalised()
+        lower, upper = pair.normalised
         kernels.surface_evidence(lower, live, *self._bounds(upper), self._strips, surface)
         nearer, farther = (np.roll(surface, shift, axis=0) for shift in (-1, 1))
         surface = np.where((surface >= nearer) & (surface >= farther), surface, np.float32(0))
@@ -229,7 +246,7 @@ class PlaneView:
         fits = np.where(is_best, np.maximum(most, PARAMETERS.wide_weight * wide), most)
         # 4. The floor, and planes beside it.
         others, levels = np.empty_like(surface), np.empty((2, *surface.shape), np.float32)
-        lower, upper = pair.normalised(BOUNDED_SIGMAS)
+        lower, upper = pair.bounded
         bounds, rows = self._bounds(upper), self.plane_rows
         kernels.floor_evidence(lower, upper, live, *bounds, rows, self._patches, self._offsets, others, levels)
         together = self._patches[:, kernels.PATCH_THIN, None].astype(np.float32)
@@ -263,7 +280,10 @@ class PlaneView:
 
     def _bounds(self, upper: Bytes) -> tuple[Bytes, Bytes]:
         """Return the bounds (2, H, DIRECTIONS) of a normalised panorama, and of what it shows on the plane."""
-        return _half_row_bounds(upper), _half_row_bounds(_remapped(upper, self._plane_map))
+        own, on_plane = np.empty((2, 2, *upper.shape), np.uint8)
+        for rows, bounds in zip(self._bound_rows, (own, on_plane), strict=True):
+            kernels.half_row_bounds(upper, rows, bounds)
+        return own, on_plane
 
     def _made_patches(self) -> tuple[Tables, Floats]:
         """Return the tables of patches and of planes of kernels.floor_evidence."""
@@ -354,27 +374,3 @@ def _row_weights(rows: Array, height: int) -> scipy.sparse.csr_array:
     above, below, before, beyond = mean(-3.6, -1.0), mean(1.0, 3.6), mean(-8.0, -3.6), mean(3.6, 8.0)
     step = above - below - 0.575 * (before - above + below - beyond)
     return scipy.sparse.csr_array((np.vstack([step, mean(-1.1, 1.1)]) / 2).astype(np.float32))
-
-
-Map = tuple[NDArray[np.int16], NDArray[np.uint16]]
-Pixels = TypeVar("Pixels", Floats, Bytes)
-
-
-def _map_of(rows: NDArray[np.floating]) -> Map:
-    """Return the map of OpenCV by which each pixel (H, DIRECTIONS) shows another row of its column."""
-    columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), rows.shape)
-    places, shares = cv2.convertMaps(columns, rows.astype(np.float32), cv2.CV_16SC2)
-    return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
-
-
-def _remapped(image: Pixels, by: Map) -> Pixels:
-    """Return an image whose pixels show what a map says."""
-    return np.asarray(cv2.remap(image, *by, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), image.dtype)
-
-
-def _half_row_bounds(image: Bytes) -> Bytes:
-    """Return the least and the most (2, H, DIRECTIONS) of an image within half a row of each pixel."""
-    above, below = np.concatenate([image[:1], image[:-1]]), np.concatenate([image[1:], image[-1:]])
-    half_above, half_below = (cv2.addWeighted(image, 0.5, other, 0.5, 0.0) for other in (above, below))
-    least = cv2.min(cv2.min(half_above, half_below), image)
-    return np.stack([least, cv2.max(cv2.max(half_above, half_below), image)])

@@ -32,7 +32,6 @@ from omnid.core.obstacles.grid import GridScan, ObstacleGrid
 from omnid.core.obstacles.plane_view import (
     AROUND_ROWS,
     AZIMUTHS,
-    BOUNDED_SIGMAS,
     FOCAL_PX,
     FloorPlane,
     PlaneView,
@@ -104,7 +103,7 @@ def ramp_ahead(pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: f
     gains = np.empty((PARTS, len(STARTS_M), len(slopes)))
     upright = np.empty((PARTS, math.ceil(view.at_1m / STARTS_M[0]), view.height))
     live, height_m = pair.seen * np.uint8(255), view.plane.height_m
-    images = *pair.normalised(BOUNDED_SIGMAS), live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
+    images = *pair.bounded, live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
     geometry = view.row0, FOCAL_PX, height_m, view.at_1m / FOCAL_PX, SEEN_M
     ramp_gains(*images, *geometry, STARTS_M, slopes, gains, upright)
     # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
