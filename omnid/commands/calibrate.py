@@ -78,7 +78,7 @@ def of_board(args: argparse.Namespace) -> int:
         is refused
     --view mirror|direct  the world is seen in a mirror or directly through a lens; the tags of an AprilTag grid show
         it, a checkerboard does not
-    --report FILE     write an HTML report with residuals and panoramas
+    --report FILE     write an HTML report with the residuals
 
     examples:
       calibrate rig boards.mcap --corners 6x7 --square-mm 30 --view mirror -o rig.toml
