@@ -289,7 +289,7 @@ def surface_evidence(
     """
     bins, width = surface.shape
     sums, second = np.empty((bins, width), np.uint16), np.zeros((bins, width), np.uint16)
-    floor, best = np.empty(width, np.uint16), np.empty(width, np.uint16)
+    half, floor, best = np.empty(width, np.uint16), np.empty(width, np.uint16), np.empty(width, np.uint16)
     value, total = np.zeros((bins + 2, width), np.float32), np.empty(width, np.float32)
     run, plain = np.zeros((bins, width), np.float32), np.empty(width, np.float32)
     surface[:] = NOTHING
@@ -302,11 +302,11 @@ def surface_evidence(
         for d in range(last):
             if n == 0:
                 sum_differences(lower, bounds, live, first, middle, d, second[d])
-            sums[d] = second[d]
-            sum_differences(lower, bounds, live, middle, end, d, second[d])
+            sum_differences(lower, bounds, live, middle, end, d, half)
             for u in range(width):
-                sums[d, u] += second[d, u]
-            lower_to(sums[d], best)
+                both = np.uint16(second[d, u] + half[u])
+                sums[d, u], second[d, u] = both, half[u]
+                best[u] = both if both < best[u] else best[u]
         # 2. The likelihoods of the floor and of all disparities.
         weights = below * BELOW_WEIGHT + (last - below)
         if strips[n, STRIP_FLOOR] > 0:

@@ -37,7 +37,7 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
-Rays = tuple[Indices, Indices]  # rows and columns (SECTORS, REACH_CELLS) of cells along the sectors
+Rays = Indices  # (REACH_CELLS, SECTORS) of cells along the sectors in a flat grid
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +182,9 @@ class ObstacleGrid:
         self._follow(place_m)
         self._eye, self._near_m = self._in_cells(self.viewpoint(pose)[:2]), float(belief.ends_m[0])
         # 1. Evidence and state of each cell, by its range and direction from the viewpoint.
-        y, x = np.indices((SIDE, SIDE), np.float32) + np.float32(0.5) - self._eye[::-1, None, None].astype(np.float32)
-        count, self._ranges_m = len(belief.first), np.hypot(x, y) * np.float32(CELL_M)
-        columns = ((math.pi - self._turn_rad + yaw) - np.arctan2(y, x)) * (count / math.tau) - 0.5
+        x, y = np.arange(SIDE, dtype=np.float32) + np.float32(0.5) - self._eye[:, None].astype(np.float32)
+        count, self._ranges_m = len(belief.first), np.hypot(x, y[:, None]) * np.float32(CELL_M)
+        columns = ((math.pi - self._turn_rad + yaw) - np.arctan2(y[:, None], x)) * (count / math.tau) - 0.5
         found, states = np.empty((3, SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.uint8)
         hides = self._hides(belief)
         near = np.where(belief.view[:, 0] > 0, np.where(hides, 2, 1), 0).astype(np.uint8)
@@ -249,18 +249,20 @@ class ObstacleGrid:
         cells (SIDE, SIDE): probability of a thing, 2 where nothing is known.
         """
         count = round(self._max_range_m / CELL_M)
-        ranges_m, occupied = STEPS_M[:count], cells[_along(place, yaw_rad)][:, :count].astype(float)
+        ranges_m, steps = STEPS_M[:count], np.arange(count)[:, None]
+        occupied = cells.take(_along(place, yaw_rad)[:count]).astype(float)
         # 1. Free is up to where the probability that a thing stands on the way is at most the risk.
-        has_ended = 1 - np.cumprod(1 - np.minimum(occupied, 1), axis=1) > RISK
-        free_m = np.where(has_ended.any(axis=1), has_ended.argmax(axis=1) * CELL_M, self._max_range_m)
+        has_ended = 1 - np.cumprod(1 - np.minimum(occupied, 1), axis=0) > RISK
+        free_m = np.where(has_ended.any(axis=0), has_ended.argmax(axis=0) * CELL_M, self._max_range_m)
         # 2. The first cells in a row in which a thing is more likely than not.
         is_thing = (occupied > 0.5) & (occupied <= 1)
-        has_passed = np.logical_or.accumulate(is_thing, axis=1) & ~is_thing
-        weight = np.where(is_thing & ~np.logical_or.accumulate(has_passed, axis=1), occupied, 0.0)
-        total = weight.sum(axis=1)
+        is_beyond = ~is_thing & (steps >= is_thing.argmax(axis=0))
+        end = np.where(is_beyond.any(axis=0), is_beyond.argmax(axis=0), count)
+        weight = np.where(is_thing & (steps < end), occupied, 0.0)
+        total = weight.sum(axis=0)
         with np.errstate(invalid="ignore"):
-            hit_m = weight @ ranges_m / total
-            variance = (weight * (ranges_m - hit_m[:, None]) ** 2).sum(axis=1) / total
+            hit_m = ranges_m @ weight / total
+            variance = (weight * (ranges_m[:, None] - hit_m) ** 2).sum(axis=0) / total
         free_m = np.minimum(free_m, np.nan_to_num(hit_m, nan=np.inf))
         hit_m[np.isnan(hit_m) & (free_m >= OPEN_SHARE * self._max_range_m)] = np.inf
         sigma_m = np.sqrt(variance + CELL_M**2 / 12)
@@ -273,11 +275,11 @@ class ObstacleGrid:
         candidates = hidden & (self._was_past > 0)
         if not candidates.any():
             return possible
-        occupied = self._occupied()[rays]
-        explained = ((occupied > 0.3) & (occupied <= 1) & (self._near_m + 3 * CELL_M > STEPS_M)).any(axis=1)
+        occupied = self._occupied().take(rays[self._near_m + 3 * CELL_M > STEPS_M])
+        explained = ((occupied > 0.3) & (occupied <= 1)).any(axis=0)
         explained = np.any([np.roll(explained, shift) for shift in range(-2, 3)], axis=0)
-        rows, columns = (of[~explained][:, self._near_m > STEPS_M] for of in rays)
-        possible[rows, columns] = candidates[rows, columns]
+        before = rays[self._near_m > STEPS_M][:, ~explained]
+        possible.flat[before] = candidates.take(before)
         return _without_specks(possible)
 
     def _arrivals(self, passed_s: float, rays: Rays, occupied: Floats, shows: Flags, possible: Bytes) -> Arrivals:
@@ -295,13 +297,13 @@ class ObstacleGrid:
         arrived = ((occupied > 0.5) & (occupied <= 1)) | (possible > 0) | ((around > p.arrival_surface) & is_most)
         arrived |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
         # The first one of each direction, before floor that was free, by the noise of stereo and more.
-        first = arrived[rays].argmax(axis=1)
-        ranges_m = np.where(arrived[rays].any(axis=1), STEPS_M[first], np.nan)
-        before_m = p.behind_m + 1.5 * ranges_m**2 / self._at_1m
-        end = np.nan_to_num(first + np.ceil(before_m / CELL_M), nan=SIDE).astype(np.intp)
-        others = np.cumsum(np.pad(~lately[rays], ((0, 0), (1, 0))), axis=1)
-        every = np.arange(SECTORS)
-        ranges_m[(end > REACH_CELLS) | (others[every, np.minimum(end, REACH_CELLS)] > others[every, first])] = np.nan
+        found, ranges_m = arrived.take(rays), np.full(SECTORS, np.nan)
+        sectors = np.flatnonzero(found.any(axis=0))
+        first = found[:, sectors].argmax(axis=0)
+        end = first + np.ceil((p.behind_m + 1.5 * STEPS_M[first] ** 2 / self._at_1m) / CELL_M).astype(np.intp)
+        steps, was_free = np.arange(REACH_CELLS)[:, None], lately.take(rays[:, sectors])
+        is_behind_free = (was_free | (steps < first) | (steps >= end)).all(axis=0) & (end <= REACH_CELLS)
+        ranges_m[sectors[is_behind_free]] = STEPS_M[first[is_behind_free]]
         for run in runs(np.isfinite(ranges_m)):
             # Who hides the nearest floor in view stands next to the base.
             range_m = float(ranges_m[run].mean())
@@ -414,11 +416,10 @@ class ObstacleGrid:
 
 
 def _along(place: Array, yaw_rad: float) -> Rays:
-    """Return rows and columns (SECTORS, REACH_CELLS) of cells along the sectors, from a place [cells], a cell apart."""
+    """Return the cells along the sectors, from a place [cells], a cell apart."""
     angle, steps = azimuths() + yaw_rad, STEPS_M / CELL_M
-    unit = np.column_stack([np.sin(angle), np.cos(angle)])
-    rows, columns = np.floor(place[::-1] + steps[:, None, None] * unit).astype(np.intp).T
-    return np.clip(rows, 0, SIDE - 1), np.clip(columns, 0, SIDE - 1)
+    x, y = (np.floor(at + np.outer(steps, of(angle))) for at, of in zip(place, (np.cos, np.sin), strict=True))
+    return np.asarray(np.clip(y, 0, SIDE - 1) * SIDE + np.clip(x, 0, SIDE - 1), np.intp)
 
 
 def _without_specks(flags: Bytes) -> Bytes:
