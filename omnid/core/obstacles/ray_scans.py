@@ -221,12 +221,14 @@ class RayScans:
         if not known.any():
             return
         # 1. Difference and gradient of both views on the plane.
-        at = view.plane_rows[rows]
-        lower, upper = (image - cv2.blur(image, (1, AROUND_ROWS)) for image in (pair.lower, pair.upper))
+        first = max(rows[0] - AROUND_ROWS, 0)
+        parts = (image[first:] for image in (pair.lower, pair.upper))
+        lower, upper = (part - cv2.blur(part, (1, AROUND_ROWS)) for part in parts)
+        at = view.plane_rows[rows] - np.float32(first)
         above, share = np.floor(at).astype(int), (at % 1)[:, None]
-        both = np.stack([upper, (np.roll(upper, -1, 0) - np.roll(upper, 1, 0)) / 2])
-        shown, gradient = both[:, above] * (1 - share) + both[:, above + 1] * share
-        difference = lower[rows] - shown
+        before, mine, after, beyond = (upper[above + row] for row in (-1, 0, 1, 2))
+        gradient = (after - before) / 2 * (1 - share) + (beyond - mine) / 2 * share
+        difference = lower[rows - first] - (mine * (1 - share) + after * share)
         # 2. Normal equations of the two slopes; single pixels that differ by much count little.
         sigma = max(MAD * float(np.median(np.abs(difference[known]))), 0.3)
         weight = known / (1.0 + (difference / (1.5 * sigma)) ** 2)
