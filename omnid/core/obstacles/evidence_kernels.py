@@ -352,33 +352,36 @@ def ramp_gains(
     against the way. starts_m (X,), slopes (S,) of ramps, seen up to the range seen_m. ramps (P, X, S). upright
     (P, K, H): by disparity, in each row above its foot.
     """
-    height = len(lower)
+    height, most = len(lower), float(OUTLIER)
+    # Of each ramp: disparity by the angle below its horizon [px], and that angle at the range up to which it is seen.
+    by_lift, least_lift = np.empty((len(starts_m), len(slopes))), np.empty((len(starts_m), len(slopes)))
+    for x in range(len(starts_m)):
+        for s in range(len(slopes)):
+            below_m = height_m + slopes[s] * starts_m[x]
+            by_lift[x, s], least_lift[x, s] = baseline_m / below_m, focal_px * below_m / seen_m
     for p in range(len(parts)):
         ramps[p], upright[p] = 0.0, 0.0
         for u in parts[p]:
+            column, rise = upper[:, u].astype(np.float64), focal_px * slopes * along[u]
             for v in range(int(row0) + 1, height):
                 on_floor = plane_rows[v]
                 if live[v, u] == 0 or on_floor > height - 2:
                     continue
-                fall, mine, most = v - row0, float(lower[v, u]), float(OUTLIER)
-                above = int(on_floor)
+                fall, mine, above = v - row0, float(lower[v, u]), int(on_floor)
                 share = on_floor - above
-                floor = min(abs(mine - (1.0 - share) * upper[above, u] - share * upper[above + 1, u]), most)
+                floor = min(abs(mine - (1.0 - share) * column[above] - share * column[above + 1]), most)
                 for k in range(math.ceil(baseline_m / height_m * fall), min(upright.shape[1], height - v)):
-                    upright[p, k, v] += floor - min(abs(mine - upper[v + k, u]), most)
+                    upright[p, k, v] += floor - min(abs(mine - column[v + k]), most)
                 for x in range(len(starts_m)):
                     # Before the start the floor is what it was.
                     if fall * starts_m[x] > focal_px * height_m * along[u]:
                         break
                     for s in range(len(slopes)):
-                        lift = fall + focal_px * slopes[s] * along[u]
-                        below_m = height_m + slopes[s] * starts_m[x]
-                        if lift * seen_m < focal_px * below_m or lift <= 0.0:
+                        lift = fall + rise[s]
+                        row = v + by_lift[x, s] * lift
+                        if lift < least_lift[x, s] or lift <= 0.0 or row >= height - 1:
                             continue
-                        row = v + baseline_m * lift / below_m
                         above = int(row)
-                        if above > height - 2:
-                            continue
                         share = row - above
-                        shown = (1.0 - share) * upper[above, u] + share * upper[above + 1, u]
+                        shown = (1.0 - share) * column[above] + share * column[above + 1]
                         ramps[p, x, s] += floor - min(abs(mine - shown), most)
