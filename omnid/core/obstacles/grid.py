@@ -212,15 +212,15 @@ class ObstacleGrid:
             self._assume_walls(yaw, hides, belief)
         # 4. What hides the nearest floor in view, behind which floor was seen before, may be anywhere before it. What
         #    hides it from the start may be where it was. And somebody may come where no pair shows the floor.
-        rays = _along(self._eye, yaw)
-        possible = self._hidden_before(hidden, rays)
+        rays, things = _along(self._eye, yaw), self._things()
+        possible = self._hidden_before(hidden, rays, things)
         if not is_first:
             visible = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
             self._spread_unknown(passed_s, visible)
         self._was_past[:] = past
         self._known[possible > 0] = 0
         # 5. What has come, and the scan.
-        occupied = self._occupied()
+        occupied = np.where((self._known > 0) | (self.odds > 0), things, np.float32(2))
         arrivals = self._arrivals(passed_s, rays, occupied, in_view & (found[kernels.RATIO] > p.arrival_nats), possible)
         self.odds[OWN, OWN], self._known[OWN, OWN], self._surface[OWN, OWN], occupied[OWN, OWN] = p.least, 1, 0, 0
         assert self._cell is not None
@@ -268,15 +268,15 @@ class ObstacleGrid:
         sigma_m = np.sqrt(variance + CELL_M**2 / 12)
         return hit_m.astype(np.float32), sigma_m.astype(np.float32), free_m.astype(np.float32)
 
-    def _hidden_before(self, hidden: Flags, rays: Rays) -> Bytes:
+    def _hidden_before(self, hidden: Flags, rays: Rays, things: Floats) -> Bytes:
         """Return the cells (1) before the nearest floor in view, hidden (SIDE, SIDE) where it was seen, of ways on
-        which nothing is known that hides it; rays: of the viewpoint."""
+        which nothing is known that hides it; rays: of the viewpoint, things (SIDE, SIDE): their probability."""
         possible = np.zeros((SIDE, SIDE), np.uint8)
         candidates = hidden & (self._was_past > 0)
         if not candidates.any():
             return possible
-        occupied = self._occupied().take(rays[self._near_m + 3 * CELL_M > STEPS_M])
-        explained = ((occupied > 0.3) & (occupied <= 1)).any(axis=0)
+        hides = (things > 0.3) & ((self._known > 0) | (self.odds > 0))
+        explained = hides.take(rays[self._near_m + 3 * CELL_M > STEPS_M]).any(axis=0)
         explained = np.any([np.roll(explained, shift) for shift in range(-2, 3)], axis=0)
         before = rays[self._near_m > STEPS_M][:, ~explained]
         possible.flat[before] = candidates.take(before)
@@ -369,13 +369,12 @@ class ObstacleGrid:
         three = (np.roll(hidden, 1) + hidden + np.roll(hidden, -1)) / 3
         return np.asarray((three > 0.5) & (belief.view[:, 0] > 0))
 
-    def _occupied(self) -> Floats:
-        """Return the probability of a thing in cells, 2 where nothing is known."""
+    def _things(self) -> Floats:
+        """Return the probability of a thing in cells (SIDE, SIDE), also where nothing is known."""
         p, (around, is_most) = self._p, self._hanging()
         hanging = np.clip(p.hanging_weight * (around - p.hanging_least), -9.0, 6.0) + np.float32(p.prior)
         hanging[~is_most] = p.least
-        occupied = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
-        return np.where((self._known > 0) | (self.odds > 0), occupied, np.float32(2))
+        return np.asarray(1 / (1 + np.exp(-np.maximum(self.odds, hanging))), np.float32)
 
     def _hanging(self) -> tuple[Floats, Flags]:
         """Return the mean surface (SIDE, SIDE) that pairs show around cells, and the cells that show at least as much:
