@@ -21,8 +21,7 @@ Numbers = NDArray[np.int32]
 LARGEST = np.uint16(np.iinfo(np.uint16).max)
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
 UNITS = 12.0  # levels of a normalised image in one sigma, because 8 bits hold ten sigmas either way
-MIDDLE, HIGHEST = np.float32(128.5), np.float32(255.0)
-ROW_PARTS = 32  # of a row, in which places between rows are given
+HIGHEST = np.float32(np.iinfo(np.uint8).max)
 OUTLIER = np.uint8(4 * UNITS)  # Most units by which a pixel differs, because more than four sigmas are no noise.
 # Log-likelihood by a unit of difference of a direction: 1 by a sigma would be that of independent pixels; and of planes
 # beside the floor, which are compared in seven directions together, with weights of 64 in all.
@@ -68,9 +67,10 @@ def bounded_band_pass(smooth: Floats, first: int, rows: int, most: np.float32, b
 @compiled("(f4[:, ::1], f4[:, ::1], f4, f4, u1[:, ::1])", writes=("levels",))
 def in_sigmas(band: Floats, contrast2: Floats, noise2: np.float32, share2: np.float32, levels: Bytes) -> None:
     """Write a band (H, W) in sigmas about the middle of 8 bits, by the variance of noise and a share of contrast2."""
+    middle = np.float32((HIGHEST + 1) / 2 + 0.5)  # with half a level, as fractions are cut
     for v in range(len(band)):
         for u in range(band.shape[1]):
-            level = np.float32(UNITS) * band[v, u] / math.sqrt(noise2 + share2 * contrast2[v, u]) + MIDDLE
+            level = np.float32(UNITS) * band[v, u] / math.sqrt(noise2 + share2 * contrast2[v, u]) + middle
             level = level if level > NOTHING else NOTHING
             levels[v, u] = np.uint8(level if level < HIGHEST else HIGHEST)
 
@@ -82,16 +82,16 @@ def half_way(one: int, other: int) -> np.uint8:
     return np.uint8((both + ((both >> 1) & 1)) >> 1)
 
 
-@compiled("(u1[:, ::1], i4[::1], u1[:, :, ::1])", writes=("bounds",))
-def half_row_bounds(image: Bytes, rows: Numbers, bounds: Bytes) -> None:
+@compiled("(u1[:, ::1], f4[::1], u1[:, :, ::1])", writes=("bounds",))
+def half_row_bounds(image: Bytes, rows: Floats, bounds: Bytes) -> None:
     """Write the least and the most (2, H, W) within half a row of each pixel of what an image (H, W) shows at rows
-    (H,), which are in parts of ROW_PARTS."""
-    last, shown = len(image) - 1, np.empty_like(image)
+    (H,), none of which is above it."""
+    last, shown, parts = len(image) - 1, np.empty_like(image), np.uint16(32)
     for v in range(last + 1):
-        above, share = image[min(rows[v] // ROW_PARTS, last)], np.uint16(rows[v] % ROW_PARTS)
-        below, rest = image[min(rows[v] // ROW_PARTS + 1, last)], np.uint16(ROW_PARTS - share)
+        row, share = divmod(round(parts * rows[v]), parts)
+        above, below, rest = image[min(row, last)], image[min(row + 1, last)], np.uint16(parts - share)
         for u in range(image.shape[1]):
-            shown[v, u] = (above[u] * rest + below[u] * share + np.uint16(ROW_PARTS // 2)) // np.uint16(ROW_PARTS)
+            shown[v, u] = np.uint16(above[u] * rest + below[u] * np.uint16(share) + parts // 2) // parts
     for v in range(last + 1):
         above, mine, below = shown[max(v - 1, 0)], shown[v], shown[min(v + 1, last)]
         for u in range(image.shape[1]):
@@ -128,11 +128,9 @@ def add_likelihoods(
     for u in range(len(into)):
         x = ONE - scale * EXP_SHARE * (np.float32(sums[u]) - np.float32(best[u]))
         x = x if x > NOTHING else NOTHING
-        x = x * x
-        x = x * x
-        x = x * x
-        x = x * x
-        into[u] = x * x
+        for _ in range(5):
+            x = x * x
+        into[u] = x
         total[u] += weight * into[u]
 
 
@@ -156,13 +154,6 @@ def add_together(sums: Words, count: int, into: Words) -> None:
             into[u] += sums[u + m]
         for u in range(width - m, width):
             into[u] += sums[u + m - width]
-
-
-@inner
-def lower_to(values: Words, into: Words) -> None:
-    """Lower `into` (W,) to values (W,)."""
-    for u in range(len(into)):
-        into[u] = values[u] if values[u] < into[u] else into[u]
 
 
 @compiled(
@@ -241,7 +232,7 @@ def floor_evidence(
                 spread(sums, next_sums)
                 spread(next_sums, sums)
                 spread(sums, next_sums)
-                lower_to(next_sums, best[kind])
+                np.minimum(next_sums, best[kind], best[kind])
         for u in range(width):
             floor_sum = np.float32(best[0, u])
             level[0, k, u] = LEVEL_SCALE * (np.float32(best[1, u]) - floor_sum)
@@ -311,7 +302,7 @@ def surface_evidence(
         weights = below * BELOW_WEIGHT + (last - below)
         if strips[n, STRIP_FLOOR] > 0:
             sum_differences(lower, on_plane, live, first, end, 0, floor)
-            lower_to(floor, best)
+            np.minimum(floor, best, best)
             add_likelihoods(floor, best, DIFFERENCE_SCALE, FLOOR_WEIGHT, plain, total)
             weights += FLOOR_WEIGHT
         for d in range(last):

@@ -176,8 +176,6 @@ class PlaneView:
         self.height = self._shown_rows + math.ceil(rise_px.max())
         rows = np.arange(self.height)
         self.plane_rows = (rows + self._floor_slope * np.maximum(rows - self.row0, 0.0)).astype(np.float32)
-        both_rows = np.stack([rows, self.plane_rows])
-        self._bound_rows = np.rint(kernels.ROW_PARTS * both_rows).astype(np.int32)
         columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self.height, DIRECTIONS))
         level_rows = (rows[:, None] - rise_px).astype(np.float32)
         self._level_map = cv2.convertMaps(columns, level_rows, cv2.CV_16SC2) if rise_px.any() else None
@@ -281,8 +279,8 @@ class PlaneView:
     def _bounds(self, upper: Bytes) -> tuple[Bytes, Bytes]:
         """Return the bounds (2, H, DIRECTIONS) of a normalised panorama, and of what it shows on the plane."""
         own, on_plane = np.empty((2, 2, *upper.shape), np.uint8)
-        for rows, bounds in zip(self._bound_rows, (own, on_plane), strict=True):
-            kernels.half_row_bounds(upper, rows, bounds)
+        kernels.half_row_bounds(upper, np.arange(self.height, dtype=np.float32), own)
+        kernels.half_row_bounds(upper, self.plane_rows, on_plane)
         return own, on_plane
 
     def _made_patches(self) -> tuple[Tables, Floats]:

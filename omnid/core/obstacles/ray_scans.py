@@ -106,6 +106,9 @@ def ramp_ahead(pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: f
     images = *pair.bounded, live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
     geometry = view.row0, FOCAL_PX, height_m, view.at_1m / FOCAL_PX, SEEN_M
     ramp_gains(*images, *geometry, STARTS_M, slopes, gains, upright)
+    by_gain = 2 * RATIO / UNITS * PARTS  # nats. Every second direction was looked at.
+    if by_gain * np.median(gains, axis=0).max() < LEAST_NATS:  # as nearly always
+        return None
     # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
     sums = np.pad(np.cumsum(upright, axis=2), ((0, 0), (0, 0), (1, 0)))
     below_m = height_m + np.outer(STARTS_M, slopes)
@@ -113,8 +116,8 @@ def ramp_ahead(pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: f
     near = np.floor(view.row0 + FOCAL_PX * height_m / STARTS_M).astype(int)[:, None]
     ends = (np.clip(rows, int(view.row0), view.height) for rows in (near + 1, far))
     things = np.subtract(*(sums[:, :, rows] for rows in ends)).max(axis=1)
-    # 3. The likeliest, which most parts show. Every second direction was looked at.
-    nats = 2 * RATIO / UNITS * PARTS * np.median(gains - np.maximum(things, 0), axis=0)
+    # 3. The likeliest, which most parts show.
+    nats = by_gain * np.median(gains - np.maximum(things, 0), axis=0)
     x, s = np.unravel_index(nats.argmax(), nats.shape)
     if nats[x, s] < LEAST_NATS or slopes[s] >= TOO_STEEP[0]:
         return None
