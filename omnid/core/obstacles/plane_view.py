@@ -268,8 +268,8 @@ class PlaneView:
         """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
         whole = np.zeros((self._shown_rows, DIRECTIONS), np.uint8)
         size = len(self._shown), self._shown_rows
-        whole[:, self._shown] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        return whole
+        whole[:, : len(self._shown)] = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return np.roll(whole, self._shown[0], axis=1)
 
     def _mask(self, flags: Flags) -> Bytes:
         """Return flags of a panorama (H, W) in the working size, with the plane's horizon level, 255 where set."""
