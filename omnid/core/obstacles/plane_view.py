@@ -180,6 +180,8 @@ class PlaneView:
         level_rows = (rows[:, None] - rise_px).astype(np.float32)
         self._level_map = cv2.convertMaps(columns, level_rows, cv2.CV_16SC2) if rise_px.any() else None
         self._visible = self._mask(visible) > 127  # (H, DIRECTIONS)
+        # Pixels that the pair before had lost, and those that it had not.
+        self._lost, self._seen = np.zeros_like(visible), self._visible
         share = self._visible[:, self._shown].mean(axis=1)
         first_row, self.last_row = _rows_in_use(share > (0.5 if bins is None else 0.0), round(self.row0))
         # 2. Stereo.
@@ -208,9 +210,9 @@ class PlaneView:
 
     def pair(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> WorkingPair:
         """Return a pair in the working size; lost (H, W): pixels that are no evidence, None: all in view are."""
-        seen = self._visible
-        if lost is not None and lost.any():
-            seen = seen & (self._mask(lost) == 0)
+        lost = np.zeros_like(self._lost) if lost is None else lost
+        if not np.array_equal(lost, self._lost):  # as in few pairs
+            self._lost, self._seen = lost, self._visible & (self._mask(lost) == 0)
         both = lower, upper
         images = [self._sized(np.ascontiguousarray(one.panorama)).astype(np.float32) for one in both]
         if self._level_map is not None:
@@ -220,7 +222,8 @@ class PlaneView:
         coding_grey = (one.gain * coding_sigma(one.jpeg_steps, self._coding_frequencies) for one in both)
         sensor_grey = math.hypot(lower.noise_grey, upper.noise_grey)
         noise_grey = math.hypot(BAND_NOISE * sensor_grey, *coding_grey)
-        return WorkingPair(images[0], images[1], seen, max(int(self.row0) - BIN_ROWS - 1, 0), sensor_grey, noise_grey)
+        floor_row = max(int(self.row0) - BIN_ROWS - 1, 0)
+        return WorkingPair(images[0], images[1], self._seen, floor_row, sensor_grey, noise_grey)
 
     def shown(self, pair: WorkingPair) -> ShownBins:
         """Return what a pair shows of the bins, by its greys and by stereo."""
