@@ -57,9 +57,7 @@ def bounded_band_pass(smooth: Floats, first: int, rows: int, most: np.float32, b
         for at in range(v - half, v + half + 1):
             other = smooth[last - abs(last - abs(at))]  # mirrored at the borders
             for u in range(len(into)):
-                above = mine[u] - other[u]
-                above = above if above < most else most
-                into[u] += above if above > -most else -most
+                into[u] += max(min(mine[u] - other[u], most), -most)
         for u in range(len(into)):
             into[u] /= np.float32(rows)
 
@@ -71,8 +69,7 @@ def in_sigmas(band: Floats, contrast2: Floats, noise2: np.float32, share2: np.fl
     for v in range(len(band)):
         for u in range(band.shape[1]):
             level = np.float32(UNITS) * band[v, u] / math.sqrt(noise2 + share2 * contrast2[v, u]) + middle
-            level = level if level > NOTHING else NOTHING
-            levels[v, u] = np.uint8(level if level < HIGHEST else HIGHEST)
+            levels[v, u] = np.uint8(max(min(level, HIGHEST), NOTHING))
 
 
 @inner
@@ -116,8 +113,7 @@ def sum_differences(
         for u in range(len(into)):
             above = np.uint8(mine[u] - most[u]) if mine[u] > most[u] else np.uint8(0)
             below = np.uint8(least[u] - mine[u]) if least[u] > mine[u] else np.uint8(0)
-            found = above | below
-            into[u] += np.uint8((found if found < OUTLIER else OUTLIER) & may[u])
+            into[u] += min(above | below, OUTLIER) & may[u]
 
 
 @inner
@@ -127,7 +123,7 @@ def add_likelihoods(
     """Write exp(-scale (sums - best)) (W,), and add so many times that to a total (W,)."""
     for u in range(len(into)):
         x = ONE - scale * EXP_SHARE * (np.float32(sums[u]) - np.float32(best[u]))
-        x = x if x > NOTHING else NOTHING
+        x = max(x, NOTHING)
         for _ in range(5):
             x = x * x
         into[u] = x
@@ -226,9 +222,8 @@ def floor_evidence(
                         both = np.uint16(upper[above, u]) * rest + np.uint16(upper[above + 1, u]) * share
                         between = np.uint8(np.uint16(both) >> np.uint16(8))
                         other = lower[v, u]
-                        apart = np.uint8(other - between) if other > between else np.uint8(between - other)
-                        apart = (apart if apart < OUTLIER else OUTLIER) & live[v, u]
-                        sums[u] = np.uint16(sums[u] + np.uint16(apart))
+                        apart = np.uint8(max(other, between) - min(other, between))
+                        sums[u] += min(apart, OUTLIER) & live[v, u]
                 spread(sums, next_sums)
                 spread(next_sums, sums)
                 spread(sums, next_sums)
@@ -254,18 +249,13 @@ def add_run(
     """
     for u in range(len(run)):
         three = before[u] + mine[u] + after[u]
-        others = total[u] - three
-        others = others if others > LEAST_LIKELIHOOD else LEAST_LIKELIHOOD
+        others = max(total[u] - three, LEAST_LIKELIHOOD)
         root = np.float32(math.sqrt(math.sqrt((three + LEAST_LIKELIHOOD) / others)))
         ratio = np.float32(2.0) * (root - ONE / root)
         without = ratio + blank
         ratio = ratio if ratio > NOTHING else (without if without < NOTHING else NOTHING)
-        ratio = ratio if ratio < STRIP_BOUND else STRIP_BOUND
-        ratio = ratio if ratio > -STRIP_BOUND else -STRIP_BOUND
-        value = run[u] + ratio - STRIP_PRIOR
-        value = value if value > NOTHING else NOTHING
-        run[u] = value
-        best[u] = value if value > best[u] else best[u]
+        run[u] = max(run[u] + max(min(ratio, STRIP_BOUND), -STRIP_BOUND) - STRIP_PRIOR, NOTHING)
+        best[u] = max(run[u], best[u])
 
 
 @compiled("(u1[:, ::1], u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], i4[:, ::1], f4[:, ::1])", writes=("surface",))
@@ -297,7 +287,7 @@ def surface_evidence(
             for u in range(width):
                 both = np.uint16(second[d, u] + half[u])
                 sums[d, u], second[d, u] = both, half[u]
-                best[u] = both if both < best[u] else best[u]
+                best[u] = min(both, best[u])
         # 2. The likelihoods of the floor and of all disparities.
         weights = below * BELOW_WEIGHT + (last - below)
         if strips[n, STRIP_FLOOR] > 0:
