@@ -1,7 +1,8 @@
 """Posterior of the first thing on each ray, from one pair.
 
 Along a direction of the panoramas the world is floor up to some bin, then the first thing: upright, a step up, a step
-down, something that hangs over floor in view, or nothing up to the last bin. Bins are half a disparity wide.
+down, something low over whose top the floor behind is seen, something that hangs over floor in view, or nothing up to
+the last bin. Bins are half a disparity wide.
 
     log p(k, c | z) = sum_{j<k} l_j(floor) + l_k(c) + sum_{j>k} l_j(behind) + log prior(k, c)
 

@@ -22,6 +22,8 @@ class RayParameters(NamedTuple):
     things_per_m: float = 0.1
     rare_per_m: float = 0.05  # of things that hang, and of slopes
     steps_per_m: float = 0.005
+    low_per_m: float = 0.02  # of low things, over whose top the floor behind is seen; along this,
+    ends_per_m: float = 2.0  # of their ends
     changes_per_m: float = 0.02  # of borders behind which the floor looks otherwise
     # Probabilities.
     similar: float = 0.1  # something looks like the floor
@@ -102,15 +104,20 @@ def posterior(
     bins, directions = terms.shape[1:]
     up, down, look, later = np.zeros(bins + 1), np.zeros(bins + 1), np.zeros(bins + 1), np.zeros(bins + 1)
     upright, steps, total = np.empty(bins), np.empty(bins), np.empty(bins)
+    begins, top = np.empty(bins), np.empty(bins)
     # Logarithms of all that does not depend on the direction.
     log_length, log_stays, log_changes, prior_odds = np.log(lengths_m), np.empty(bins), np.empty(bins), np.empty(bins)
     for n in range(bins):
         change = min(p.changes_per_m * lengths_m[n], 0.1)
         log_stays[n], log_changes[n] = math.log1p(-change), math.log(change)
-        prior = min((p.things_per_m + p.rare_per_m) * lengths_m[n], 0.5)
+        prior = min((p.things_per_m + p.rare_per_m + p.low_per_m) * lengths_m[n], 0.5)
         prior_odds[n] = math.log(prior / (1.0 - prior))
     log_things, log_over = math.log(p.things_per_m), math.log(p.rare_per_m)
     log_steps, log_slopes = math.log(p.steps_per_m), math.log(p.rare_per_m)
+    log_low, log_ends, log_top = math.log(p.low_per_m), np.empty(bins), np.empty(bins)
+    for n in range(bins):
+        end = min(p.ends_per_m * lengths_m[n], 0.5)
+        log_ends[n], log_top[n] = math.log(end), math.log1p(-end)
     log_similar, log_other_look = math.log(p.similar), math.log1p(-p.similar)
     other_at_start = min(0.1 * p.changes_per_m * nearest_m, 0.5)
     log_known, log_other = math.log1p(-other_at_start), math.log(other_at_start)
@@ -126,35 +133,53 @@ def posterior(
             later[n] = later[n + 1] + likely * p.things_per_m * lengths_m[n]
         # 2. What ends the floor beyond the last bin shows its foot, too.
         foot = math.log(p.invisible + (1.0 - p.invisible) / (1.0 + math.exp(-2.0 * (far_edges[u] - 4.0))))
-        # 3. The classes of each bin; `before`: floor up to it, which looks as known, or otherwise: beyond a border of
-        #    sun or of another covering.
-        before, slope, as_known, other_look, looks = 0.0, -1e9, log_known, log_other, 0.0
+        # 3. What begins in a bin, low or upright, given the floor before it.
         for n in range(bins):
             own = terms[EDGE, n - 1, u] if n else 0.0  # a step reaches into the bin before
             similar = log_sum(log_similar + min(max(look[n], -30.0), 30.0), log_other_look)
-            here = before + looks - own + terms[BEGINS, n, u] + similar + math.log1p(later[min(n + APART, bins)])
-            here += log_length[n]
-            upright[n] = here + terms[FITS, n, u] + log_things
-            steps[n] = here + log_sum(down[n], up[n]) + log_steps
+            begins[n] = terms[BEGINS, n, u] - own + log_length[n]
+            upright[n] = begins[n] + similar + math.log1p(later[min(n + APART, bins)])
+        # 4. From a bin on: floor that looks as known, or otherwise, up to what ends it; and the top of something low,
+        #    which is seen up to where the floor goes on. Half of these ends show a surface, nearer than that floor.
+        known_on, other_on, top_on = foot - log_2, foot - log_2, -1e9
+        for n in range(bins - 1, -1, -1):
+            surface = max(terms[FITS, n, u], terms[FITS, max(n - 2, 0), u], 0.0)
+            end = log_ends[n] + log_sum(0.0, surface) - log_2
+            top_on = log_sum(top_on + log_top[n], log_sum(known_on, log_other + other_on) + end) + terms[ABOVE, n, u]
+            top[n] = top_on
+            ends = upright[n] + terms[FITS, n, u] + log_things
+            floor = terms[FLOOR, n, u] + terms[EDGE, n, u]
+            known_on += terms[LOOK, n, u]
+            known_before = log_sum(log_stays[n] + known_on, log_changes[n] + other_on)
+            other_on = log_sum(floor + log_sum(log_stays[n] + other_on, log_changes[n] + known_on), ends)
+            known_on = log_sum(floor + known_before, ends)
+        # 5. The classes of each bin; `before`: floor up to it, which looks as known, or otherwise: beyond a border of
+        #    sun or of another covering.
+        before, slope, as_known, other_look, looks = 0.0, -1e9, log_known, log_other, 0.0
+        for n in range(bins):
+            here = before + looks
+            level = log_sum(down[n], up[n]) + log_steps
+            steps[n] = here + log_sum(upright[n] + level, begins[n] + top[n] + log_low)
+            upright[n] += here + terms[FITS, n, u] + log_things
             slope = log_sum(slope, before + looks + up[n] + look[n] + log_slopes + log_length[n])
             before += terms[FLOOR, n, u] + terms[EDGE, n, u]
             kept = log_sum(as_known + log_stays[n], other_look + log_changes[n]) + terms[LOOK, n, u]
             other_look = log_sum(other_look + log_stays[n], as_known + log_changes[n])
             as_known, looks = kept, log_sum(kept, other_look)
         none = log_sum(before + looks + foot - log_2, slope + foot)
-        # 4. Nearer than the view: the look of floor may have been learned from it, or it has one of its own.
+        # 6. Nearer than the view: the look of floor may have been learned from it, or it has one of its own.
         #    What is plain shows fewer edges.
         nearer = log_nearer + log_sum(look[0], log_sum(0.0, plain) - log_2)
-        # 5. Something that hangs over floor in view: all that may begin beyond.
+        # 7. Something that hangs over floor in view: all that may begin beyond.
         beyond = high = none
         for n in range(bins - 1, -1, -1):
-            begins = log_sum(upright[n], steps[n])
+            here = log_sum(upright[n], steps[n])
             hanging = beyond + terms[FITS, n, u] - p.surface_noise + log_over + log_length[n]
-            total[n] = log_sum(begins, hanging)
-            beyond = log_sum(beyond, begins)
+            total[n] = log_sum(here, hanging)
+            beyond = log_sum(beyond, here)
             high = max(high, total[n])
         high = max(high, nearer)
-        # 6. Normalised. What may be nearer hides the first bin, but is no evidence for its place.
+        # 8. Normalised. What may be nearer hides the first bin, but is no evidence for its place.
         hidden = math.exp(nearer - high)
         last = math.exp(none - high)
         weight = last + hidden
@@ -166,7 +191,7 @@ def posterior(
         for n in range(bins):
             found = total[n] / weight
             first[u, n] = found if n else found + hidden
-            # 7. For the grid: log-ratio of a thing here, where the ray comes, to its prior.
+            # 9. For the grid: log-ratio of a thing here, where the ray comes, to its prior.
             ratios[u, n], view[u, n] = 0.0, reach
             if reach > LEAST_REACH:
                 rate = min(max(found / reach, 1e-6), 1.0 - 1e-6)
