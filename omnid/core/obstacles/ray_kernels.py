@@ -110,7 +110,7 @@ def posterior(
     for n in range(bins):
         change = min(p.changes_per_m * lengths_m[n], 0.1)
         log_stays[n], log_changes[n] = math.log1p(-change), math.log(change)
-        prior = min((p.things_per_m + p.rare_per_m + p.low_per_m) * lengths_m[n], 0.5)
+        prior = min((p.things_per_m + p.rare_per_m) * lengths_m[n], 0.5)
         prior_odds[n] = math.log(prior / (1.0 - prior))
     log_things, log_over = math.log(p.things_per_m), math.log(p.rare_per_m)
     log_steps, log_slopes = math.log(p.steps_per_m), math.log(p.rare_per_m)
