@@ -80,6 +80,16 @@ class Bar:
 
 
 @dataclass(frozen=True)
+class Block:
+    """Something low around the robot, of one grey level, with floor behind it."""
+
+    range_m: float
+    depth_m: float
+    height_m: float
+    grey: float = 75.0
+
+
+@dataclass(frozen=True)
 class Slope:
     """The floor beyond a line across the way rises."""
 
@@ -96,7 +106,7 @@ class Walls:
     board_grey: float = 60.0
 
 
-Thing = Pole | Bar | Slope | Walls
+Thing = Pole | Bar | Block | Slope | Walls
 
 
 def panoramas(
@@ -147,4 +157,9 @@ def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing:
     elif isinstance(thing, Bar):
         height = height_m + thing.range_m * rays[:, 2]
         grey = np.where((height > thing.heights_m[0]) & (height < thing.heights_m[1]), thing.grey, grey)
+    elif isinstance(thing, Block):
+        at_front_m = height_m + thing.range_m * rays[:, 2]
+        on_top_m = r * (1 - thing.height_m / height_m)
+        is_top = (on_top_m > thing.range_m) & (on_top_m < thing.range_m + thing.depth_m)
+        grey = np.where(is_top | ((at_front_m > 0) & (at_front_m < thing.height_m)), thing.grey, grey)
     return np.asarray(grey.reshape(columns.shape))

@@ -18,6 +18,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     CYLINDER,
     T_RECT_BASE,
     Bar,
+    Block,
     Pattern,
     Pole,
     Slope,
@@ -122,6 +123,14 @@ def test_a_hanging_bar_is_where_it_is_seen(floor: Pattern) -> None:
     ranges_m = np.linalg.norm(scan.grid.corner_m + CELL_M * cells, axis=1)
     away_m = np.abs(ranges_m[ranges_m < 2.2] - 1.4)
     assert len(away_m) > 200 and np.quantile(away_m, 0.95) < 0.125
+
+
+@pytest.mark.hazard("H19")
+@pytest.mark.parametrize("floor", [worn, stains])
+def test_something_low_begins_at_its_front(floor: Pattern) -> None:
+    """Over its top, which shows nothing, the floor behind is seen: its end alone is a surface."""
+    scan = Standing(floor).scan(Block(1.4, 0.4, 0.1), pairs=PAIRS)
+    assert np.median(scan.free_m) > 1.2 and np.quantile(scan.free_m, 0.98) < 1.5
 
 
 @pytest.mark.hazard("H19")
