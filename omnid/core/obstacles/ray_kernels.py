@@ -22,12 +22,12 @@ class RayParameters(NamedTuple):
     things_per_m: float = 0.1
     rare_per_m: float = 0.05  # of things that hang, and of slopes
     steps_per_m: float = 0.005
-    low_per_m: float = 0.02  # of low things, over whose top the floor behind is seen; along this,
-    ends_per_m: float = 2.0  # of their ends
-    no_end: float = 0.1  # an end that shows no surface
+    low_per_m: float = 0.02  # of low things, over whose top the floor behind is seen
+    ends_per_m: float = 2.0  # of the end of a low thing, along its top
     changes_per_m: float = 0.02  # of borders behind which the floor looks otherwise
     # Probabilities.
     similar: float = 0.1  # something looks like the floor
+    no_end: float = 0.1  # the end of a low thing shows no surface
     invisible: float = 0.005  # the end of the floor beyond the last bin shows no foot
     nearer: float = 0.02  # something begins nearer than the view and looks like the floor; and otherwise
     marks: float = 0.02  # m: an edge in a bin of the floor, before any was seen
@@ -116,7 +116,7 @@ def posterior(
     log_things, log_over = math.log(p.things_per_m), math.log(p.rare_per_m)
     log_steps, log_slopes = math.log(p.steps_per_m), math.log(p.rare_per_m)
     log_low, log_ends, log_top = math.log(p.low_per_m), np.empty(bins), np.empty(bins)
-    log_no_end = math.log(p.no_end)
+    log_no_end, log_end_shows = math.log(p.no_end), math.log1p(-p.no_end)
     for n in range(bins):
         end = min(p.ends_per_m * lengths_m[n], 0.5)
         log_ends[n], log_top[n] = math.log(end), math.log1p(-end)
@@ -142,11 +142,12 @@ def posterior(
             begins[n] = terms[BEGINS, n, u] - own + log_length[n]
             upright[n] = begins[n] + similar + math.log1p(later[min(n + APART, bins)])
         # 4. From a bin on: floor that looks as known, or otherwise, up to what ends it; and the top of something low,
-        #    which is seen up to where the floor goes on. Its end is a surface, nearer than that floor.
+        #    which is seen up to where the floor goes on. Its end is a surface, up to a
+        #    disparity nearer than that floor.
         known_on, other_on, top_on = foot - log_2, foot - log_2, -1e9
         for n in range(bins - 1, -1, -1):
             surface = max(terms[FITS, n, u], terms[FITS, max(n - 2, 0), u])
-            end = log_ends[n] + log_sum(log_no_end, surface if surface > 0.0 else -30.0)
+            end = log_ends[n] + log_sum(log_no_end, log_end_shows + surface if surface > 0.0 else -30.0)
             top_on = log_sum(top_on + log_top[n], log_sum(known_on, log_other + other_on) + end) + terms[ABOVE, n, u]
             top[n] = top_on
             ends = upright[n] + terms[FITS, n, u] + log_things
