@@ -13,7 +13,7 @@ from calib.boards.board import AnyBoard, AprilGrid, Board
 from calib.boards.checkerboard import find_board
 from calib.models.camera import Array
 from calib.models.ocam import View
-from calib.validation import LineReporter, silent
+from calib.validation import LineReporter
 from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
@@ -31,7 +31,7 @@ def search_board(image: Image, board: AnyBoard) -> Array | None:
     return find_board(image, board) if isinstance(board, Board) else find_april_grid(image, board)
 
 
-def find_boards(images: Images, board: AnyBoard, progress: LineReporter = silent) -> dict[str, Array]:
+def find_boards(camera: str, images: Images, board: AnyBoard, progress: LineReporter) -> dict[str, Array]:
     """Return the corners (N, 2) [px] by the names of the images that show a board; OmnidError if there is none."""
     views = dict[str, Array]()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -41,11 +41,11 @@ def find_boards(images: Images, board: AnyBoard, progress: LineReporter = silent
             if view is not None:
                 views[name] = view
                 outcome = f"board found, {np.isfinite(view[:, 0]).sum()} of {len(view)} corners"
-            progress(f"[{number}/{len(images)}] {name}: {outcome}")
+            progress(f"[{number}/{len(images)}] {camera} camera, {name}: {outcome}")
     if not views:
         raise OmnidError(
-            f"calibrate: no {board} in any of {len(images)} images; check the options of the board, and take images "
-            "with the whole board in view, near, sharp and well lit"
+            f"calibrate: no {board} in any of {len(images)} images of the {camera} camera; check the options of the "
+            "board, and take images with the whole board in view, near, sharp and well lit"
         )
     return views
 

@@ -12,7 +12,6 @@ from calib import se3
 from calib.boards.board import AnyBoard, AprilGrid, Board
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.rig_uncertainty import drive_uncertainty
-from calib.models.camera import Array
 from calib.models.names import sees_directly
 from calib.models.ocam import View
 from calib.rig import SIDES, Rig, mounting_notes, rig_between
@@ -120,12 +119,7 @@ def calibrate_rig(
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: LineReporter) -> list[PairView]:
     """Find the board in the images of both cameras."""
-    found = list[dict[str, Array]]()
-    for name, side in zip(SIDES, images.sides, strict=True):
-        try:
-            found.append(find_boards(side, board, progress))
-        except OmnidError as error:
-            raise OmnidError(f"{name} camera: {error}") from error
+    found = [find_boards(name, side, board, progress) for name, side in zip(SIDES, images.sides, strict=True)]
     seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names]
     return [view for view in seen if view.is_seen]
 

@@ -124,10 +124,6 @@ def evaluate_run(args: argparse.Namespace) -> int:
     if known:
         print(f"the truth is of a body turned by {known['turned_deg']} deg: fitted, so the errors are optimistic")
     print(metrics)
-    if not known and args.align == "origin":
-        with suppress(OmnidError):
-            if metrics.ate_rmse_m > 10 * evaluate(estimate, truth, tolerance_s, "rigid").ate_rmse_m:
-                print("most of the position error is one rotation: is the truth of other axes? try --frame auto")
     return 0
 
 

@@ -187,8 +187,11 @@ def list_routes(args: argparse.Namespace) -> int:
       route list
     """
     folder = RouteFolder(Path(settings_of(args).navigation.routes))
-    for route in map(folder.read, folder.names()):
+    routes = list(map(folder.read, folder.names()))
+    for route in routes:
         print(f"{route.name:<20} {route.length_m:8.1f} m  {utc(route.created_s * 10**9)}  {route.map_name}")
+    if not routes:
+        print(f"no routes in {folder.folder} (navigation.routes)")
     return 0
 
 

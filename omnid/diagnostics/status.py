@@ -249,7 +249,9 @@ class StatusCollector:
         pair, images = self._pair, self._stages["pair"]
         stats = pair.stats()
         missing = [name for name, stamp_ns in pair.newest_ns.items() if not self._age_s(stamp_ns) <= TIMEOUT_S]
-        pairs_hz, broken_hz = (self._rate_hz(name, stats[name]) for name in ("pairs", "broken"))
+        pairs_hz, broken_hz, *unpaired_hz = (
+            self._rate_hz(name, stats[name]) for name in ("pairs", "broken", "unpaired_lower", "unpaired_upper")
+        )
         processed_hz, dropped_hz = (
             self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
         )
@@ -261,7 +263,9 @@ class StatusCollector:
             "too slow: the computer leaves images out; close other programs, or start omnid with --profile small": (
                 dropped_hz > NOTABLE_SHARE * (processed_hz + dropped_hz)
             ),
-            "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them": pairs_hz == 0,
+            "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them": (
+                pairs_hz == 0 and all(unpaired_hz)
+            ),
         }
         return stats | {"_warning": next((words for words, applies in warnings.items() if applies), "")}
 

@@ -7,6 +7,7 @@ between them. The same checks come before a map is written, so that none is repl
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -64,6 +65,7 @@ def read_places(path: str | Path) -> tuple[PlaceMap, PlaceRig]:
     try:
         if path.exists() and not path.is_file():
             raise ValueError("it is no regular file")
+        zipfile.ZipFile(path).close()  # What numpy raises for another file advises to unpickle it.
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in _ARRAYS}
         _check(arrays)

@@ -27,6 +27,7 @@ class Metrics:
     length_error_ratio: float  # (estimate - truth) / truth; negative: too short; NaN where the truth does not move
     ate_rmse_m: float  # absolute position error
     ate_max_m: float
+    ate_aligned_m: float  # rmse of the positions after their best alignment; where it is small, the axes may differ
     end_error_m: float
     rpe_translation_rmse_m: float  # relative pose error from each associated pose to the next
     rpe_rotation_rmse_rad: float
@@ -51,6 +52,8 @@ class Metrics:
             ("heading error", heading),
             ("step error (RPE)", f"rmse {step_mm:.2f} mm, {step_deg:.3f} deg"),
         ]
+        if self.ate_rmse_m > 10 * self.ate_aligned_m:
+            rows += [("", "most of the ATE is one rotation: is the truth of other axes? try `omnid eval --frame auto`")]
         return "\n".join(f"{name:<21} {value}" for name, value in rows)
 
 
@@ -77,6 +80,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
         length_error_ratio=(est_m - true_m) / true_m if true_m > 0.0 else math.nan,
         ate_rmse_m=_rms(position_m),
         ate_max_m=float(position_m.max()),
+        ate_aligned_m=_aligned_rms(est_xyz, true_xyz),
         end_error_m=float(position_m[-1]),
         rpe_translation_rmse_m=_rms(np.linalg.norm(step_xyz, axis=1)),
         rpe_rotation_rmse_rad=_rms(np.linalg.norm(se3.rotation_log(step_R), axis=1)),
@@ -138,6 +142,13 @@ def _span(trajectory: Trajectory) -> str:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _aligned_rms(xyz: Array, true_xyz: Array) -> float:
+    """Return the rmse [m] of positions (N, 3) after the rotation and translation that make it smallest (Kabsch)."""
+    xyz, true_xyz = xyz - xyz.mean(axis=0), true_xyz - true_xyz.mean(axis=0)
+    shared = 2 * np.linalg.svd(xyz.T @ true_xyz, compute_uv=False).sum()
+    return math.sqrt(max(0.0, float((xyz**2).sum() + (true_xyz**2).sum() - shared)) / len(xyz))
 
 
 def aligned(T_est: Array, T_true: Array, alignment: str) -> Array:

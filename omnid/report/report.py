@@ -121,7 +121,8 @@ def _plan(run: RecordedRun, events: Sequence[Event]) -> list[str]:
     chosen = np.unique(np.linspace(0, len(xy) - 1, 1000).astype(int))
     places = np.column_stack([run.t_s[chosen], shares_of(axes, xy[chosen])]).round(4).tolist()
     named = {_path_name(rank): f"the path, {STATES[rank]}" if rank >= 0 else "the path" for rank in stretches}
-    named |= {"map": "in the map"} if len(run.map_xy) else {}
+    is_hidden = run.map_xy.shape == xy.shape and np.allclose(run.map_xy, xy)  # below the path of odometry
+    named |= {"map": "in the map"} if len(run.map_xy) and not is_hidden else {}
     keys = [f"<span class='key'><i class='p-{name}'></i>{words}</span>" for name, words in named.items()]
     keys += ["<span class='key'>✕ lost here</span>"] if lost_s else []
     footnote = (

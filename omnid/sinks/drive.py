@@ -17,7 +17,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate
-from omnid.navigation_state import with_reason
+from omnid.navigation_state import NavigationState, with_reason
 from omnid.stages.obstacles import controller_scan
 from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer, Answers
@@ -61,8 +61,10 @@ def navigation_answers(update: NavigationUpdate) -> Answers | None:
     """Return the answer to the newest request to the navigation; a repeated answer has no effect."""
     if update.answer is None:
         return None
-    refusal = update.answer.refusal
-    text = refusal or f"accepted; navigation: {with_reason(update.state, update.reason)}"
+    refusal, state = update.answer.refusal, update.state
+    is_idle = state.is_end and state is not NavigationState.CANCELLED
+    words = "no drive is under way" if is_idle else f"navigation: {with_reason(state, update.reason)}"
+    text = refusal or f"accepted; {words}"
     return {update.answer.id: Answer(not refusal, text)}
 
 

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FLOOR_WARNING: Final = (
-    "the rig states no height of the cameras: map, grid and obstacles know nothing, and call nothing free; state it by "
+    "the rig has no height of the cameras: obstacles, grid and map are unknown, and nothing is free; state it by "
     "`omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
 )
 

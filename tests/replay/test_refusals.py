@@ -38,7 +38,7 @@ TABLE = (
     ("replay {log} --set nonsense", "expected section.key=value"),
     ("replay {log} --set odometry.method=magic", "'paper'"),
     ("replay {log} --seconds 0", "--seconds: expected 0.001 or more, found '0'"),
-    ("replay {log} --rig {rig} --map {log}", "expected a map of places"),
+    ("replay {log} --rig {rig} --map {log}", "found another file or a damaged one: File is not a zip file"),
     ("replay {log} --rig {rig} --set motor.port={folder}/tty", "does not use motor.port"),
     ("eval {rig}", "the following arguments are required"),
     ("run --once", "add --log"),

@@ -162,5 +162,5 @@ export function showMapFile(part) {
   byId("map-box").hidden = part === undefined;
   if (part === undefined) return;
   const saves = new Map(part.values).get("saves") ?? "0";
-  byId("map-file").textContent = part.level ? part.message : `saved ${saves} times since the start`;
+  byId("map-file").textContent = part.level ? part.message : `saves since the start: ${saves}`;
 }

@@ -1,4 +1,4 @@
-// The stick: a motion as long as a finger holds it, or an arrow key. Released is stop; so is a page that is not seen.
+// The stick: a motion as long as a finger holds it, or an arrow key. Letting go stops; so does a page that is hidden.
 import { post } from "./commands.js";
 import { byId } from "./elements.js";
 

@@ -132,7 +132,7 @@ def test_images_without_a_board_are_one_line_and_exit_code_2(
         cv2.imwrite(str(tmp_path / f"upper_{k:02d}.png"), np.full((480, 480), 90, np.uint8))
     assert run("-o", tmp_path / "rig.toml", tmp_path) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images" in line
+    assert "no board of 7x6 inner corners in any of 3 images of the upper camera" in line
     assert not (tmp_path / "rig.toml").exists()
 
 

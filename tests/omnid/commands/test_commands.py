@@ -54,6 +54,7 @@ def test_check_names_what_is_wrong(omnid: Command, tmp_path: Path) -> None:
     assert "expected one of line, roboteq" in omnid.refused("motor", "test", "--motor", "simulated", "--config", file)
     file.write_text("[bus]\nrobot = 'a/*'\n")
     assert "bus.robot is 'a/*'" in omnid.refused("config", "check", file)
+    assert omnid("route", "list", "--set", f"navigation.routes={tmp_path}").out.startswith(f"no routes in {tmp_path} ")
 
 
 FEW = 8  # pairs of a replay of 0.75 s

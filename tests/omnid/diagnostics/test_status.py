@@ -57,11 +57,11 @@ class AcceptingMotor:
 class Daemon:
     """The parts of a daemon whose status is collected."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, pairing: PairConfig | None = None) -> None:
         self.statistics = RunStatistics(RobotClock())
         self.stages = {name: StageStats() for name in ("pair", "motor")}
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
-        self.pair = Synchronise(rig, PairConfig())
+        self.pair = Synchronise(rig, pairing or PairConfig())
         self.motor = AcceptingMotor()
         self.controller = Controller(self.motor, ControllerSettings().without_obstacles, 0.05)
         self.controller_statistics = ControllerStatistics(self.stages["motor"])
@@ -144,6 +144,16 @@ def test_a_camera_without_images_is_named(daemon: Daemon) -> None:
     assert (entries["upper camera"].level, entries["upper camera"].message) == (ERROR, "no new image")
     assert float(entries["upper camera"].values[Key.AGE_S]) == pytest.approx(TIMEOUT_S + 2, abs=0.2)
     assert entries["lower camera"].level == OK
+
+
+def test_cameras_that_are_not_synchronised_are_named_and_a_pause_without_images_is_not(rig: Rig) -> None:
+    daemon = Daemon(rig, PairConfig(tolerance_ms=1))
+    daemon.collected()
+    for number in range(10):
+        daemon.shoot("lower", age_s=1.0 - 0.1 * number)
+        daemon.shoot("upper", age_s=1.03 - 0.1 * number)
+    assert "synchronise them" in daemon.collected()["pairing"].message
+    assert daemon.collected()["pairing"].level == OK
 
 
 def test_a_computer_that_is_too_slow_is_named_with_what_to_do(daemon: Daemon) -> None:

@@ -156,7 +156,7 @@ def test_the_axes_of_another_body_are_fitted(
     assert main(["eval", est, true, "--frame", "auto"]) == 0
     assert "fitted, so the errors are optimistic" in capsys.readouterr().out
     assert main(["eval", est, true]) == 0
-    assert "try --frame auto" in capsys.readouterr().out
+    assert "try `omnid eval --frame auto`" in capsys.readouterr().out
 
 
 # The rule for which topic holds the poses: one table of cases, through all commands that read recorded runs

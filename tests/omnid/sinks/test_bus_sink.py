@@ -178,6 +178,8 @@ def test_setpoints_and_answers_of_the_navigation_are_sent() -> None:
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answer=RequestAnswer(4, "pause", ""))
     refused = replace(update, setpoint=None, answer=RequestAnswer(5, "repeat lost", "no route lost"))
     assert navigation_answers(update) == {4: Answer(True, "accepted; navigation: paused: by a request")}
+    reached = replace(update, state=NavigationState.REACHED, reason="")
+    assert navigation_answers(reached) == {4: Answer(True, "accepted; no drive is under way")}
     assert navigation_answers(refused) == {5: Answer(False, "no route lost")}
     for each in (update, refused):
         LiveDrive(link, np.eye(4), health).process(each)
