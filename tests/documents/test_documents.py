@@ -156,7 +156,7 @@ def test_the_cells_of_the_notebook_run(monkeypatch: pytest.MonkeyPatch) -> None:
             exec("".join(cell["source"]), names)
     names["plt"].close("all")
     assert names["errors"].ate_rmse_m < 0.01  # of 4.8 m; `omnid demo` prints 1 mm
-    assert names["errors"].pairs == 99
+    assert names["errors"].pairs == 97
 
 
 def test_the_wiring_beside_the_figure_is_that_of_the_code() -> None:

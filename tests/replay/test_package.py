@@ -34,7 +34,7 @@ def test_the_sample_is_small_and_whole() -> None:
     log = files("omnid.sample") / "log.mcap"
     assert isinstance(log, Path) and log.stat().st_size < 8e6
     reader = LogReader(log)
-    assert sum(1 for _ in reader.frames()) == 198 and not reader.warnings
+    assert sum(1 for _ in reader.frames()) == 194 and not reader.warnings
     assert "rig.toml" in reader.attachments()
 
 
@@ -78,4 +78,4 @@ def test_wheel_and_sdist_are_complete_and_the_wheel_runs_by_itself(tmp_path: Pat
     assert found.startswith(str(tmp_path / "installed"))
     imported = "import importlib, omnid.runs.replay, omnid.runs.live, omnid.web, omnid.report, omnid.doctor"
     python("-c", imported)
-    assert "198" in python("-m", "omnid", "log", "info", str(tmp_path / "installed/omnid/sample/log.mcap"))
+    assert "194" in python("-m", "omnid", "log", "info", str(tmp_path / "installed/omnid/sample/log.mcap"))
