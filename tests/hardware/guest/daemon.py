@@ -30,7 +30,7 @@ from tests.hardware.guest.surroundings import (
     until,
 )
 
-RESULTS = Path("/mnt/job/results")
+CURSOR = Path("/run/journal-of-the-tests")
 RULES = """SUBSYSTEM=="video4linux", KERNEL=="video10", SYMLINK+="omnid/lower"
 SUBSYSTEM=="video4linux", KERNEL=="video11", SYMLINK+="omnid/upper"
 SUBSYSTEM=="tty", KERNEL=="ttyS1", SYMLINK+="omnid/motor"
@@ -107,7 +107,7 @@ def journal_lines() -> list[str]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def unit() -> Iterator[None]:
+def unit() -> None:
     """omnid as the README installs it."""
     load_loopback()
     run("busybox", "ip", "link", "set", "lo", "up")
@@ -128,8 +128,13 @@ def unit() -> Iterator[None]:
     run("udevadm", "control", "--reload")
     run("udevadm", "trigger", "--settle", "--subsystem-match=video4linux", "--subsystem-match=tty")
     run("systemctl", "daemon-reload")
+
+
+@pytest.fixture(autouse=True)
+def print_journal() -> Iterator[None]:
+    """Print what each test added to the journal, which its failure then shows."""
     yield
-    (RESULTS / "journal").write_text("\n".join(journal_lines()))
+    print(run("journalctl", "-u", "omnid", "--no-pager", "-o", "short-monotonic", f"--cursor-file={CURSOR}"))
 
 
 @pytest.fixture(scope="module")
