@@ -81,7 +81,8 @@ class Exposure:
     def shift(self, points: Array) -> ViewShift:
         """Return the shifts of points (N, 3) [m] in the rectified frame at the stamp."""
         if self.times.is_synchronised:
-            return ViewShift(np.zeros((len(points), 4)), np.zeros((len(points), 4, 0)), self.motion)
+            count, unknowns = len(points), len(self.motion.twist)
+            return ViewShift(np.zeros((count, 4)), np.zeros((count, 4, unknowns)), self.motion)
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
         seen = view(points, cylinder, baseline_m)
         lower_s, upper_s = self.times.lower(seen[:, :2]), self.times.upper(seen[:, [0, 2]])

@@ -15,6 +15,7 @@ from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.recognition import Relocaliser
+from omnid.core.types.pixel_times import SYNCHRONISED, PixelTimes
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
@@ -81,6 +82,18 @@ def test_the_path_through_a_right_angle_and_its_error_are_estimated(
         error = se3.log(se3.inverse(estimate.T_odom_rect) @ truth(k))
         assert error @ np.linalg.solve(estimate.covariance, error) < 30  # a chi-square of six degrees of freedom
         assert np.sqrt(np.diag(estimate.covariance)).max() < 5e-3
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_cameras_whose_stamps_differ_in_some_pairs_only_are_tracked(
+    odometry: VisualOdometry, frames: list[StereoFrame], first: int
+) -> None:
+    """As at the start, where the scatter of the stamps is not known: the first map may be made again at any pair."""
+    times = [PixelTimes(skew_s=2e-3), SYNCHRONISED]
+    seen = [replace(frame, times=times[(first + k) % 2]) for k, frame in enumerate(frames)]
+    for k, estimate in enumerate(run(odometry, seen)):
+        assert motion_errors(estimate.T_odom_rect, truth(k))[0] < 0.02, k
+        assert (estimate.state, estimate.resets) == (TrackingState.TRACKING, 0)
 
 
 def test_few_landmarks_all_around_support_each_pose(cameras: RenderedCameras) -> None:
