@@ -1,12 +1,14 @@
 """A moving picture of a drive to a goal: `python -m tests.bench.film WORLD SEED FILE.gif`.
 
-From above, in odom: floor that is free (white), unknown (grey) or occupied (red) by the grid of that moment; the true
-outlines (black), the straight way to the goal (blue), and the base with its way so far (green).
+What the lower camera sees, as a panorama. Below it, from above in odom: floor that is free (white), unknown (grey) or
+occupied (red) by the grid of that moment; the true outlines (black), the straight way to the goal (blue), and the base
+with its way so far (green).
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +19,8 @@ from PIL import Image
 from calib.se2_arrays import composed, planar, relative
 from omnid.config import load_config
 from omnid.core.obstacles.grid import CELL_M, FREE, OCCUPIED, FloorGrid
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.simulation.lockstep import Moment, Request
 from tests.bench.obstacles import Array, Asker, Planned, prepared, settings_for
 from tests.simulation.disturbed import simulate
 
@@ -27,6 +31,7 @@ AROUND_M: Final = 2.0  # about start and goal that is shown
 COLOURS: Final = {FREE: (255, 255, 255), OCCUPIED: (90, 90, 220)}  # of cells, blue first
 UNKNOWN_COLOUR, TRUTH, PLAN, BASE = (190, 190, 190), (0, 0, 0), (220, 90, 0), (0, 140, 0)
 FACTOR: Final = 1 << 4  # OpenCV's points are in sixteenths of a pixel
+GREY_STEP: Final = 16  # of panoramas, whose noise would fill the file
 
 
 class Canvas:
@@ -64,8 +69,18 @@ class Canvas:
 def film(planned: Planned) -> list[np.ndarray]:
     """Make the drive; return its pictures."""
     asked, robot = prepared(planned)
-    config, asker = load_config(None, settings_for(planned)), Asker(asked, planned)
-    run = simulate(asked.world, robot, asker, seconds=90.0, seed=planned.seed, config=config)
+    config, asker, panoramas = (
+        load_config(None, settings_for(planned)),
+        Asker(asked, planned),
+        dict[int, PaddedPanorama](),
+    )
+
+    def keep(moment: Moment) -> Iterable[Request]:
+        if moment.odometry is not None:
+            panoramas[moment.odometry.stamp_ns] = moment.odometry.depth.panoramas.lower
+        return asker(moment)
+
+    run = simulate(asked.world, robot, keep, seconds=90.0, seed=planned.seed, config=config)
     assert asked.goal is not None, "a film needs a world with a goal"
     # 1. The truth in odom, and what is shown of it.
     from_start = relative(np.array(asked.world.start), np.zeros(3))
@@ -80,7 +95,7 @@ def film(planned: Planned) -> list[np.ndarray]:
     pictures, way = [], np.array([planar(scan.T_odom_base) for scan in run.scans])
     for number in range(0, len(run.scans), EVERY):
         scan, canvas = run.scans[number], Canvas(corner_m, size_m)
-        if scan.grid is None:
+        if scan.grid is None or scan.stamp_ns not in panoramas:
             continue
         canvas.cells(scan.grid)
         for outline in outlines:
@@ -94,7 +109,10 @@ def film(planned: Planned) -> list[np.ndarray]:
         cv2.circle(canvas.image, canvas.pixels(np.array([[x, y]]))[0].tolist(), radius_px, BASE, 2, cv2.LINE_8, 4)
         nose = [x + robot.radius_m * np.cos(heading), y + robot.radius_m * np.sin(heading)]
         canvas.line(np.array([[x, y], nose]), BASE, 2)
-        pictures.append(canvas.image)
+        view = panoramas[scan.stamp_ns].panorama
+        view = cv2.resize(view, (canvas.width, canvas.width * len(view) // view.shape[1]), interpolation=cv2.INTER_AREA)
+        grey = cv2.cvtColor(view // GREY_STEP * GREY_STEP, cv2.COLOR_GRAY2BGR)
+        pictures.append(np.vstack([grey, canvas.image]))
     return pictures
 
 

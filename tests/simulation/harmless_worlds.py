@@ -209,10 +209,12 @@ def _two_rooms(b: Builder, door_m: float, at_y_m: float) -> float:
     return x_m
 
 
-def _door(b: Builder, aslant: str) -> Trial:
-    """A door of 0.8 m, straight ahead or 30 degrees aside."""
-    door_y_m = 0.0 if not aslant else float(b.rng.choice([-1, 1])) * math.tan(math.radians(30.0)) * 2.0
+def _door(b: Builder, kind: str) -> Trial:
+    """A door of 0.8 m, straight ahead or 30 degrees aside, or with a chair before it and two behind."""
+    door_y_m = 0.0 if kind != "_aslant" else float(b.rng.choice([-1, 1])) * math.tan(math.radians(30.0)) * 2.0
     wall_m = _two_rooms(b, 0.8, door_y_m)
+    for x_m, y_m in ((-0.9, -0.75), (0.9, 0.8), (1.4, -0.6)) if kind == "_chairs" else ():
+        b.star_chair((wall_m + x_m, y_m), b.rng.uniform(0, math.tau))
     return Trial(built(b), goal=(wall_m + 1.8, door_y_m, 0.0))
 
 
@@ -307,7 +309,7 @@ MAKERS: Final[Makers] = {
     "trolley_leaves": (None, _trolley_leaves),
     "person_passes": (None, _person_passes),
     "person_comes": (None, _person_comes),
-    "door_80(_aslant|)": (None, _door),
+    "door_80(_aslant|_chairs|)": (None, _door),
     "office": (None, _office),
     "clutter": (None, _clutter),
     "dead_end_and_back": (None, _dead_end_and_back),
