@@ -63,6 +63,9 @@ def test_wheel_and_sdist_are_complete_and_the_wheel_runs_by_itself(tmp_path: Pat
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
         packed.extractall(tmp_path / "installed")
+    (metadata,) = (tmp_path / "installed").glob("*/METADATA")
+    assert "License-Expression: Apache-2.0" in metadata.read_text()
+    assert not [name for name in names if name.startswith("tests/")]
     assert tracked("omnid", "drivers", "calib") - names == set()
     assert {f"omnid/service/{name}" for name in tracked("systemd")} - names == set()
     with tarfile.open(sdist) as source:
