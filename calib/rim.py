@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib.models.camera import Array, Mask
 
-AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would give the same
+AZIMUTHS = 720  # steps of half a degree, which is INLIER_PX on a rim of 230 px
 # Least difference of grey levels between the middle and the corners; half of it across the edge at one azimuth.
 MIN_CONTRAST = 25.0
 # Threshold between the dark (0) and the light level (1), nearer the dark one, because the world at the rim is often
@@ -18,7 +18,7 @@ EDGE_FRACTION = 0.25
 EDGE_PX = 4
 # An azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle.
 INLIER_PX, MIN_SUPPORT = 2.0, 0.6
-# Margin inside the rim and outside the hub, because blur and the last reflections at the edge.
+# Margin inside the rim and outside the hub, for blur and the last reflections at the edge.
 SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
 # dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins.

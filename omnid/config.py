@@ -107,7 +107,6 @@ class LiveConfig:
     """Reports of `omnid run`."""
 
     status_s: Annotated[float, Meta(ge=0.1, le=60), "period of the status, s"] = 1.0
-
     cloud_s: Annotated[float, Meta(ge=0, le=3600), "period of the maps on the bus, s; 0: only at the end"] = 2.0
 
 

@@ -1,8 +1,8 @@
-"""Policy on imports: which rooms may never import which others.
+"""Policy on imports: which packages may never import which others.
 
-A room is a package folder; a module that lies directly in `calib`, `drivers` or `omnid` is a room of its own. Rooms
-form tiers, and imports point to the same or a lower tier, without circles. Rules name what single rooms must not
-import at all. A room that no tier names fails, and so does a tier or a rule that names a room that does not exist.
+A module that lies directly in `calib`, `drivers` or `omnid` counts as a package of its own. Packages form tiers, and
+imports point to the same or a lower tier, without circles. Rules name what single packages must not import at all. A
+package that no tier names fails, and so does a tier or a rule that names a package that does not exist.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = ("calib", "drivers", "omnid")
 
-# From the lowest tier to the highest: a room imports rooms of its own tier and of lower ones, never of a higher one.
-# A name covers the room and the rooms below it, unless one of these has a place of its own.
+# From the lowest tier to the highest: a package imports those of its own tier and of lower ones, never of a higher one.
+# A name covers the package and the packages below it, unless one of these has a place of its own.
 TIERS: Mapping[str, str] = {
     "geometry": "calib",
     "hardware and logs": "drivers",
@@ -38,9 +38,9 @@ TIERS: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """No file of a room, or of the rooms below it, imports any of the modules; some files are excepted."""
+    """No file of a package, or of the packages below it, imports any of the modules; some files are excepted."""
 
-    room: str
+    package: str
     forbidden: tuple[str, ...]
     excepted: tuple[str, ...] = ()
 
@@ -56,11 +56,7 @@ RULES = (
     Rule("omnid.web", ("omnid.stages", "omnid.runs", "omnid.controller", "drivers.cameras", "drivers.motors")),
     Rule("calib", ("threading", "_thread", "time", "socket", "logging")),
     Rule("drivers.motors", ("numpy", "cv2")),
-    Rule(
-        "omnid",
-        ("threading", "_thread"),
-        excepted=("omnid/engine/graph.py",),
-    ),
+    Rule("omnid", ("threading", "_thread"), excepted=("omnid/engine/graph.py",)),
     Rule(
         "omnid",
         ("zenoh",),
@@ -86,8 +82,8 @@ class Import:
     name: str  # full name of what is imported
 
     @property
-    def room(self) -> str:
-        """The room of the file, such as "omnid.core.stereo", or "omnid.settings" for omnid/settings.py."""
+    def package(self) -> str:
+        """The package of the file, such as "omnid.core.stereo", or "omnid.settings" for omnid/settings.py."""
         parts = Path(self.file).with_suffix("").parts
         return ".".join(parts if len(parts) == 2 and parts[1] != "__init__" else parts[:-1])
 
@@ -112,26 +108,26 @@ def imports() -> tuple[Import, ...]:
 
 
 @cache
-def room_of_module(module: str) -> str | None:
-    """Return the room that an imported name lies in; None for what is not ours."""
+def package_of_module(module: str) -> str | None:
+    """Return the package that an imported name lies in; None for what is not ours."""
     parts = module.split(".")
     if parts[0] not in LAYERS:
         return None
     while len(parts) > 1 and not (path := ROOT.joinpath(*parts)).is_dir():
         if path.with_suffix(".py").exists():
-            return Import(path.with_suffix(".py").relative_to(ROOT).as_posix(), "").room
+            return Import(path.with_suffix(".py").relative_to(ROOT).as_posix(), "").package
         parts.pop()
     return ".".join(parts)
 
 
 def measured_arrows() -> dict[str, set[str]]:
-    """Return for each room the other rooms that its files import."""
+    """Return for each package the other packages that its files import."""
     files = [path.relative_to(ROOT).as_posix() for layer in LAYERS for path in (ROOT / layer).rglob("*.py")]
-    arrows: dict[str, set[str]] = {Import(file, "").room: set() for file in files}
+    arrows: dict[str, set[str]] = {Import(file, "").package: set() for file in files}
     for each in imports():
-        target = room_of_module(each.name)
-        if target not in (None, each.room):
-            arrows[each.room].add(str(target))
+        target = package_of_module(each.name)
+        if target not in (None, each.package):
+            arrows[each.package].add(str(target))
     return arrows
 
 
@@ -140,46 +136,46 @@ def breaches(rule: Rule) -> list[str]:
     return [
         f"{each.file}: {each.name}"
         for each in imports()
-        if f"{each.room}.".startswith(f"{rule.room}.") and each.file not in rule.excepted
+        if f"{each.package}.".startswith(f"{rule.package}.") and each.file not in rule.excepted
         if any(f"{each.name}.".startswith(f"{forbidden}.") for forbidden in rule.forbidden)
     ]
 
 
-def tier_of(room: str) -> int | None:
-    """Return the tier that names the room or the nearest room above it; None where no tier does.
+def tier_of(package: str) -> int | None:
+    """Return the tier that names the package or the nearest package above it; None where no tier does.
 
-    `omnid` itself covers the package's own file only, so that a new room has to be placed.
+    `omnid` itself covers its own file only, so that a new package has to be placed.
     """
     named = {name: tier for tier, names in enumerate(TIERS.values()) for name in names.split()}
-    parts = room.split(".")
+    parts = package.split(".")
     above = [".".join(parts[:length]) for length in range(len(parts), 0, -1)]
-    return next((named[name] for name in above if name in named and (name == room or name != "omnid")), None)
+    return next((named[name] for name in above if name in named and (name == package or name != "omnid")), None)
 
 
-def test_every_room_has_a_tier_and_every_tier_names_rooms_that_exist() -> None:
-    rooms = set(measured_arrows())
+def test_every_package_has_a_tier_and_every_tier_names_packages_that_exist() -> None:
+    packages = set(measured_arrows())
     named = [name for names in TIERS.values() for name in names.split()]
-    assert [room for room in sorted(rooms) if tier_of(room) is None] == []
+    assert [package for package in sorted(packages) if tier_of(package) is None] == []
     assert sorted(set(named)) == sorted(named)
-    assert [name for name in named if not any(f"{room}.".startswith(f"{name}.") for room in rooms)] == []
+    assert [name for name in named if not any(f"{package}.".startswith(f"{name}.") for package in packages)] == []
 
 
 def test_imports_point_to_the_same_or_a_lower_tier() -> None:
     upward = [
-        f"{room} -> {target}"
-        for room, targets in measured_arrows().items()
+        f"{package} -> {target}"
+        for package, targets in measured_arrows().items()
         for target in sorted(targets)
-        if (tier_of(room) or 0) < (tier_of(target) or 0)
+        if (tier_of(package) or 0) < (tier_of(target) or 0)
     ]
     assert upward == []
 
 
-def test_rooms_do_not_import_each_other_in_circles() -> None:
-    TopologicalSorter(measured_arrows()).prepare()  # raises CycleError with the rooms of the circle
+def test_packages_do_not_import_each_other_in_circles() -> None:
+    TopologicalSorter(measured_arrows()).prepare()  # raises CycleError with the packages of the circle
 
 
-@pytest.mark.parametrize("rule", RULES, ids=lambda rule: f"{rule.room} without {rule.forbidden[0]}")
-def test_rooms_keep_clear_of_modules_that_are_not_theirs(rule: Rule) -> None:
-    assert ROOT.joinpath(*rule.room.split(".")).is_dir()
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: f"{rule.package} without {rule.forbidden[0]}")
+def test_packages_import_no_module_that_is_barred_to_them(rule: Rule) -> None:
+    assert ROOT.joinpath(*rule.package.split(".")).is_dir()
     assert all((ROOT / path).exists() for path in rule.excepted)
     assert breaches(rule) == []

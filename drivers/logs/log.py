@@ -23,7 +23,7 @@ from drivers.logs.ros_messages import STAMPED_TYPES, header_stamp
 # Bounds of what is kept in memory, whatever a file states.
 MAX_RECORD_BYTES: Final = 256 * 2**20  # of a message, of an image and of an unpacked chunk
 KEPT_CHUNKS: Final = 4  # that stay unpacked: both cameras, wheels and gyro may have been written one after the other
-LATEST_NS: Final = 2**62  # A time beyond is none; the difference of two times fits 64 bits.
+LATEST_NS: Final = 2**62  # Later times are invalid; the difference of two times fits 64 bits.
 ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame (RFC 8878); no message begins with them
 
 # When a message was logged, the stamp of its header if it begins with one (0 if unset), and where it is. In a file,

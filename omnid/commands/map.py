@@ -64,7 +64,7 @@ def build(args: argparse.Namespace) -> int:
         if not new.exists():
             return 1
         places, rig = read_places(new)
-    # 3. It is whole now.
+    # 3. Replace the map, which holds all logs now.
     write_places(args.output, places, rig)
     options.print_entries(_described(args.output, places, rig))
     return 0

@@ -83,7 +83,7 @@ class RunPlaces:
         self._saves, self._error = 0, ""  # number of saves; error of the last one
 
     def copy(self, message: PlaceUpdate | int) -> MapCopy | None:
-        """Return a copy of the map after a pose, where it is due, or after a request for it, of which the id comes."""
+        """Take a pose, or the id of a request to save; return a copy of the map after a pose where one is due."""
         if isinstance(message, int):
             self._request_ids.append(message)
             return None

@@ -118,8 +118,8 @@ class SimulatedCameras:
 
 
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
-# What a controller is given; a stop disarms.
-Given: TypeAlias = ControlInput | ContactState | Literal["stop"]
+# Messages to the controller; a stop disarms.
+Message: TypeAlias = ControlInput | ContactState | Literal["stop"]
 
 
 class Tick(NamedTuple):
@@ -177,8 +177,8 @@ class Vehicle:
             limited=drive.limited,
         )
         self._period_ns = round(1e9 / config.motor.rate_hz)
-        self._posted: SimpleQueue[tuple[int, int, Given]] = SimpleQueue()  # when it is due [ns], number
-        self._waiting: list[tuple[int, int, Given]] = []
+        self._posted: SimpleQueue[tuple[int, int, Message]] = SimpleQueue()  # when it is due [ns], number
+        self._waiting: list[tuple[int, int, Message]] = []
         self._numbers, self._arrived_ns = count(), 0
         self._wheel_noise, self._gyro_noise = random.Random(seed), random.Random(seed + 1)
         self.samples: list[MotionSample] = []  # since the last pair
@@ -199,22 +199,22 @@ class Vehicle:
         """Return the true pose (4, 4) of the rig."""
         return self.T_world_base @ self.robot.rig.T_base_rig
 
-    def post(self, given: Given, due_ns: int = 0) -> None:
-        """Have the controller given something before its first tick at or after a time; from any thread.
+    def post(self, message: Message, due_ns: int = 0) -> None:
+        """Deliver a message to the controller before its first tick at or after a time; from any thread.
 
-        A pose or an obstacle scan needs the robot's pose_delay_s from its images. It is on its way when `advance` is
-        called next. A setpoint or a request without a time of arrival arrives then.
+        A pose or an obstacle scan arrives pose_delay_s of the robot after its images. A setpoint or a request without a
+        time of arrival arrives when `advance` is called next.
         """
-        if isinstance(given, ControllerPose | ControllerScan):
-            due_ns = given.stamp_ns + round(self.robot.pose_delay_s * 1e9)
-        self._posted.put((due_ns, next(self._numbers), given))
+        if isinstance(message, ControllerPose | ControllerScan):
+            due_ns = message.stamp_ns + round(self.robot.pose_delay_s * 1e9)
+        self._posted.put((due_ns, next(self._numbers), message))
 
     def pairs(self, wait: Callable[[], object]) -> Iterator[Exposure]:
         """Yield pair after pair. wait: returns when the messages that follow from the pairs before have been posted."""
         for seq in count():
             # 1. The body moves by what the controller knows; the images show it there.
             stamp_ns = self._start_ns + round(seq * 1e9 / self.robot.rate_hz)
-            self.advance(stamp_ns, ticks_then=False)
+            self.advance(stamp_ns, includes_end=False)
             frames = self.images(seq, stamp_ns)
             # 2. What has been answered meanwhile takes effect with the tick of now.
             wait()
@@ -227,23 +227,23 @@ class Vehicle:
         T_world_rig = self.T_world_rig
         return [self.cameras.frame(camera, seq, stamp_ns, T_world_rig, self.people) for camera in CAMERAS]
 
-    def advance(self, until_ns: int, *, ticks_then: bool = True) -> None:
+    def advance(self, until_ns: int, *, includes_end: bool = True) -> None:
         """Advance to a time, with all ticks and samples that are due until then.
 
-        ticks_then: those that are due just then, too; otherwise the next call gives them.
+        includes_end: also those that are due at that very time; otherwise they are left to the next call.
         """
         while not self._posted.empty():
             heapq.heappush(self._waiting, self._posted.get())
-        while (due_ns := min(self._tick_ns, self._gyro_ns)) < until_ns + ticks_then:
-            self._pass(due_ns)
+        while (due_ns := min(self._tick_ns, self._gyro_ns)) < until_ns + includes_end:
+            self._elapse(due_ns)
             if due_ns == self._gyro_ns:
                 self._gyro_ns += round(1e9 / self.robot.gyro_hz)
             if due_ns == self._tick_ns:
                 while self._waiting and self._waiting[0][0] <= self.now_ns:
-                    self._give(heapq.heappop(self._waiting)[2])
+                    self._deliver(heapq.heappop(self._waiting)[2])
                 self._tick()
                 self._tick_ns += self._period_ns
-        self._pass(until_ns)
+        self._elapse(until_ns)
 
     def come_to_rest(self) -> None:
         """Have the controller stop the wheels permanently."""
@@ -263,19 +263,19 @@ class Vehicle:
         )
         return left_m, right_m
 
-    def _give(self, given: Given) -> None:
-        """Give the controller something, which arrives after what it was given before, and after the tick before."""
+    def _deliver(self, message: Message) -> None:
+        """Deliver a message, which arrives after all earlier messages and after the tick before."""
         self._arrived_ns = max(self._arrived_ns, self._tick_ns - self._period_ns) + 1
-        if given == "stop":
+        if message == "stop":
             self.controller.stop(self._arrived_ns)
-        elif isinstance(given, ContactState):
-            self.controller.touch(given)
-        elif isinstance(given, TimedSetpoint | ArmRequest) and not given.arrival_ns:
-            self.controller.take(given._replace(arrival_ns=self._arrived_ns))
+        elif isinstance(message, ContactState):
+            self.controller.touch(message)
+        elif isinstance(message, TimedSetpoint | ArmRequest) and not message.arrival_ns:
+            self.controller.take(message._replace(arrival_ns=self._arrived_ns))
         else:
-            self.controller.take(given)
+            self.controller.take(message)
 
-    def _pass(self, until_ns: int) -> None:
+    def _elapse(self, until_ns: int) -> None:
         """Let the time until a stamp pass: the base moves, the gyro gives the mean of its turn, people walk."""
         before, dt_s = self.base.pose, (until_ns - self.now_ns) * 1e-9
         self.now_ns = until_ns

@@ -1,4 +1,4 @@
-"""What browsers show of the robot, as the news that they ask for.
+"""The state of the robot for browsers, as changes since the version that each of them has.
 
 zenoh calls in its own threads: they only put a message into a bounded inbox, or replace the newest one, and wake the
 event loop. Nothing that a browser does can reach that far. A browser asks for what has changed since the news that it
@@ -50,12 +50,12 @@ class RobotFeed:
         self.state, self._inbox_thread = RobotState(_NEWEST_ONLY), ThreadPoolExecutor(1)
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
-        # Of the news: it grows by one each time, and more slowly than this first one, which is Unix time in ms: pages
-        # that were open while this program started again have seen none of them.
+        # The version of the news begins as Unix time in ms and grows by one with each news, which is slower than that
+        # time: a page that was open before this program started has a smaller version.
         self.version = time.time_ns() // 1_000_000
         self._news: dict[str, tuple[int, Any]] = {}  # newest content of each kind, and the version that it came with
         self._images: dict[str, Response] = {}  # cells of the map, and the panorama
-        self._wanted_until_s = -math.inf  # the panorama
+        self._wanted_until_s = -math.inf  # until then a browser shows the panorama
         self._map_in_odom: list[float] | None = None
 
     def news(self, seen: int) -> dict[str, Any]:
@@ -124,7 +124,7 @@ class RobotFeed:
                 end_panorama = None
 
     def _set(self, kind: str, content: Any) -> None:
-        """Have a content sent with the next news."""
+        """Send a content with the next news."""
         self._news[kind] = self.version + 1, content
 
     def process_inbox(self) -> None:

@@ -43,7 +43,7 @@ BOTH = (T_LOWER_IMU, T_UPPER_LOWER @ T_LOWER_IMU)
 NAMED = ("/lower/image_raw", "/upper/image_raw")
 
 
-def test_parses_every_number_as_kalibr_defines_it() -> None:
+def test_every_number_is_parsed_as_kalibr_defines_it() -> None:
     rig = parse_chain(chain(BOTH, T_UPPER_LOWER, NAMED) + "  timeshift_cam_imu: 0.01\n")
     bent = (0.01, -0.02, 0.003, 0.004)
     assert rig.lower.camera == UnifiedCamera(1.0, (-207.0, 208.0), (383.5, 384.5), (768, 770), bent)
@@ -67,7 +67,7 @@ SIZE, FOCAL, CENTER = (768, 770), (225.0, 228.0), (380.0, 390.0)
          UnifiedCamera(0.0, FOCAL, CENTER, SIZE, (-0.1, 0.01, 0.001, 0.0002))),
     ],
 )  # fmt: skip
-def test_reads_lenses_and_keeps_them_in_rig_files(
+def test_lenses_are_imported_and_kept_in_rig_files(
     tmp_path: Path, names: tuple[str, str], intrinsics: list[float], coefficients: list[float], expected: OmniCamera
 ) -> None:
     camera = (
@@ -107,7 +107,7 @@ def test_the_lower_camera_is_known_by_name_topic_or_height() -> None:
         (np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "90 deg off"),  # z forward
     ],
 )
-def test_warns_of_axes_of_an_imu_that_no_rig_has(R_imu_rig: Array, off: str) -> None:
+def test_axes_of_an_imu_that_no_rig_has_give_a_warning(R_imu_rig: Array, off: str) -> None:
     T_rig_imu = se3.transform(R_imu_rig.T, np.zeros(3))
     T_upper_rig = se3.transform(np.eye(3), (0.0, 0.0, -0.2))
     text = chain((T_rig_imu, T_upper_rig @ T_rig_imu), None, NAMED)
@@ -115,7 +115,7 @@ def test_warns_of_axes_of_an_imu_that_no_rig_has(R_imu_rig: Array, off: str) -> 
     assert not any("deg off" in line for line in warnings_of(text, frame="cameras"))
 
 
-def test_selects_two_of_three_cameras_by_name() -> None:
+def test_two_of_three_cameras_are_selected_by_name() -> None:
     text = chain(BOTH, T_UPPER_LOWER, NAMED) + f"cam2:{CAMERA}  T_cn_cnm1: {T_UPPER_LOWER.tolist()}\n"
     with pytest.raises(CalibError, match="expected two cameras, found cam0, cam1, cam2"):
         parse_chain(text, lower="cam0")
@@ -195,7 +195,7 @@ TEXT = """#polynomial coefficients for the DIRECT mapping function (ocam_model.s
 T_LOWER_UPPER = se3.exp([0.02, -0.01, -0.2, 0.02, 0.05, 0.3])
 
 
-def test_parses_every_number_as_the_toolbox_defines_it() -> None:
+def test_every_number_is_parsed_as_the_toolbox_defines_it() -> None:
     for text in (TEXT, TEXT.replace("\n", "\r\n"), TEXT.replace("480 640", "480, 640  # height, width")):
         assert parse_ocam(text, "direct") == OcamCamera(
             (-231.5, 0.0, 1.54e-3, -5.96e-7, 1.59e-9),
@@ -222,7 +222,7 @@ def test_errors_of_ocam_files_are_one_line(old: str, new: str, message: str) -> 
     assert str(caught.value).startswith("c.txt: ") and "\n" not in str(caught.value)
 
 
-def test_imports_a_rig_from_two_files(tmp_path: Path) -> None:
+def test_two_files_are_imported_as_a_rig(tmp_path: Path) -> None:
     (tmp_path / "lower.txt").write_text(TEXT)
     (tmp_path / "upper.txt").write_text(TEXT.replace("480 640", "481 641"))
     rig = import_pair(tmp_path / "lower.txt", tmp_path / "upper.txt", T_LOWER_UPPER)

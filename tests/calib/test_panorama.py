@@ -80,7 +80,7 @@ def test_cameras_that_share_no_view_are_refused() -> None:
 
 
 @pytest.mark.parametrize(("field_deg", "is_enough"), [(190, False), (195, False), (230, True)])
-def test_lenses_back_to_back_side_by_side_need_a_shared_ring(field_deg: float, is_enough: bool) -> None:
+def test_lenses_back_to_back_side_by_side_need_shared_elevations(field_deg: float, is_enough: bool) -> None:
     """Lenses of 190 degrees share 10 of them about their common axis, those of 195 a bit less than 15, of 230 50."""
     camera = lens("equidistant", field_deg, (640, 640))
     poses = [
@@ -125,7 +125,7 @@ def assert_ring(mask: Mask | None, inner: float = 0.0, outer: float = RADIUS) ->
 
 
 @pytest.mark.parametrize("guess", [CENTER, (384.0, 384.0), (410.0, 350.0)])
-def test_finds_a_drawn_rim_from_different_guesses(guess: tuple[float, float]) -> None:
+def test_a_drawn_rim_is_found_from_different_guesses(guess: tuple[float, float]) -> None:
     assert_ring(find_rim(drawn(), guess))
 
 
@@ -140,12 +140,12 @@ NOTHING: dict[str, Callable[[], NDArray[np.float64]]] = {
 
 
 @pytest.mark.parametrize("name", NOTHING)
-def test_returns_none_for_images_without_a_rim(name: str) -> None:
+def test_images_without_a_rim_give_none(name: str) -> None:
     image = np.clip(NOTHING[name](), 0, 255).astype(np.uint8)
     assert find_rim(image, (image.shape[1] / 2, image.shape[0] / 2)) is None
 
 
-def test_finds_the_rim_of_a_real_mirror(shared_data: Path) -> None:
+def test_the_rim_of_a_real_mirror_is_found(shared_data: Path) -> None:
     """Ten images of one mirror: the image cuts off its rim above and below, and the lens is in its middle."""
     images: list[Any] = [
         cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((shared_data / "vmr_board").glob("*.jpg"))

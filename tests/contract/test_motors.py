@@ -88,7 +88,7 @@ def test_limiting_the_wheel_speed_keeps_the_curvature(name: str, velocity_mps: f
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("field", ["velocity_mps", "yaw_rate_radps", "heading_rad"])
-def test_refuses_numbers_that_are_not_finite(name: str, bad: float, field: str) -> None:
+def test_numbers_that_are_not_finite_are_refused(name: str, bad: float, field: str) -> None:
     command = replace(VelocityCommand(0, 0.1, 0.1, 0.1), **{field: bad})
     with pytest.raises(DriverError, match="only finite"):
         next(PROTOCOLS[name](BASE).drive(command))
@@ -175,7 +175,7 @@ def test_watchdog_stops_a_late_host_and_a_stop_comes_before_motion(name: str) ->
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_stop_comes_before_motion_after_the_host_was_suspended(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """CLOCK_MONOTONIC stands meanwhile, CLOCK_BOOTTIME does not, nor does the controller's watchdog."""
+    """CLOCK_MONOTONIC stops meanwhile, CLOCK_BOOTTIME does not, nor does the controller's watchdog."""
     with connected_motor(name) as (motor, simulated):
         assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
         simulated.expire()
@@ -249,7 +249,7 @@ def send_error(motor: SerialMotor) -> DriverError:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_recovers_from_garbage(name: str) -> None:
+def test_the_driver_recovers_from_garbage(name: str) -> None:
     rng = random.Random(21)
     with connected_motor(name, timeout_s=SHORT_S) as (motor, simulated):
         for _ in range(20):

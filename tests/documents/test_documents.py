@@ -144,7 +144,7 @@ def test_nav2_uses_topics_that_exist() -> None:
     assert parameters["controller_server"]["ros__parameters"]["enable_stamped_cmd_vel"] is False
 
 
-NOTEBOOK = Path(__file__).parents[2] / "omnid" / "examples" / "first_replay.ipynb"
+NOTEBOOK = ROOT / "omnid" / "examples" / "first_replay.ipynb"
 
 
 def test_the_cells_of_the_notebook_run(monkeypatch: pytest.MonkeyPatch) -> None:

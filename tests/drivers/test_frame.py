@@ -79,7 +79,7 @@ def test_raw_images_with_and_without_padding_of_rows(encoding: str, padding: int
     np.testing.assert_array_equal(gray(frame(encoding, memoryview(data), step=step)), expected(pixels))
 
 
-def test_decodes_jpeg_without_huffman_tables() -> None:
+def test_jpeg_without_huffman_tables_is_decoded() -> None:
     """Motion JPEG leaves the standard tables out (USB Video Class 1.5, payload of MJPEG, 3.1)."""
     data, bare, at = encoded(".jpg"), b"\xff\xd8", 2
     while data[at + 1] != 0xDA:
@@ -102,7 +102,7 @@ def interrupted(sampling: int) -> tuple[bytes, list[int]]:
 
 @pytest.mark.parametrize("sampling", [cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444])
 @pytest.mark.parametrize("lost", [1, 8])
-def test_refuses_a_jpeg_of_which_rows_of_blocks_were_lost(sampling: int, lost: int) -> None:
+def test_a_jpeg_that_lost_rows_of_blocks_is_refused(sampling: int, lost: int) -> None:
     """OpenCV reports success, and shows what follows a gap of three rows 24 px higher up."""
     whole, markers = interrupted(sampling)
     broken = whole[: markers[9]] + whole[markers[9 + lost] :]
@@ -135,7 +135,7 @@ def test_images_differ_from_their_jpegs_by_the_stated_error(quality: int, highes
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_detects_truncation_at_any_byte(suffix: str) -> None:
+def test_a_truncation_at_any_byte_is_detected(suffix: str) -> None:
     data, encoding = encoded(suffix), {".jpg": "jpeg", ".png": "png"}[suffix]
     for size in range(len(data)):
         for padding in (0, 300):
@@ -158,7 +158,7 @@ def test_detects_truncation_at_any_byte(suffix: str) -> None:
         (frame("mono8", np.zeros((HEIGHT, 2 * WIDTH), np.uint8)[:, ::2]), "contiguous"),
     ],
 )
-def test_refuses_malformed_frames_in_one_line(broken: Frame, reason: str) -> None:
+def test_malformed_frames_are_refused_in_one_line(broken: Frame, reason: str) -> None:
     with pytest.raises(FrameDecodeError, match=reason) as caught:
         gray(broken)
     assert "\n" not in str(caught.value) and "lower frame 7" in str(caught.value)
@@ -179,7 +179,7 @@ def test_damaged_images_raise_only_decode_errors(suffix: str) -> None:
 
 @pytest.mark.parametrize(("suffix", "encoding"), [(".jpg", "jpeg"), (".png", "png")])
 @pytest.mark.parametrize(("side", "words"), [(60000, "60000 x 60000"), (5000, "5000 x 5000 px of")])
-def test_refuses_images_whose_samples_would_fill_the_memory(suffix: str, encoding: str, side: int, words: str) -> None:
+def test_images_that_would_fill_the_memory_are_refused(suffix: str, encoding: str, side: int, words: str) -> None:
     """Decoders of progressive JPEG and interlaced PNG store the samples of all channels."""
     data = encoded(suffix)
     assert 3 * side * side > MAX_PIXELS

@@ -194,13 +194,13 @@ def read_by_node(log: Path) -> tuple[dict[str, Any], Expected]:
     return head, found
 
 
-def test_reads_the_numbers_that_were_written(known: Known) -> None:
+def test_others_read_the_numbers_that_were_written(known: Known) -> None:
     head, found = read_by_node(known.path)
     assert head == {"profile": "ros2", "attachments": {name: digest(data) for name, data in ATTACHED.items()}}
     assert found == known.expected
 
 
-def test_reads_a_live_recording_as_rosbags_does(live: Path) -> None:
+def test_the_reader_reads_a_live_recording_as_rosbags_does(live: Path) -> None:
     expected: Expected = {}
     with AnyReader([live]) as bag:
         for place, _, data in bag.messages():
@@ -214,7 +214,7 @@ pytestmark = pytest.mark.interop
 
 
 @pytest.mark.parametrize("topic", ["odom", "pose"])
-def test_reads_the_poses_that_were_written(known: Known, tmp_path: Path, topic: str) -> None:
+def test_others_read_the_poses_that_were_written(known: Known, tmp_path: Path, topic: str) -> None:
     found = trajectory(known.path, tmp_path, topic)
     wanted = known.expected[f"/omnid/{topic}"]
     poses = [message["pose"]["pose"] if topic == "odom" else message["pose"] for message in wanted]

@@ -286,7 +286,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
     assert math.hypot(state["x"] - 1.0, state["y"] - 1.0) < 0.15
 
 
-def test_sends_commands() -> None:
+def test_the_driver_sends_commands() -> None:
     received: list[Request] = []
     freshness = Freshness(60.0)
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
@@ -380,7 +380,7 @@ def write_rounds(path: Path, scales: tuple[float, ...]) -> None:
     ("scales", "code", "longest"),
     [((1.0, 1.0, 1.0), 0, "+0.0"), ((1.02, 0.98), 1, "+2.0")],  # the latter is right in the mean only
 )
-def test_errors_of_rounds(
+def test_the_errors_of_rounds_are_measured(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,

@@ -21,7 +21,7 @@ from tests.ports import free_port
 EXAMPLES = {words: command_at(place).examples for words, (place, _) in COMMANDS.items()}
 
 
-def test_no_words_are_a_question_for_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_call_without_words_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     assert "install-service" in capsys.readouterr().out
 
@@ -115,7 +115,7 @@ def test_a_signal_while_modules_are_loaded_ends_the_program_quietly() -> None:
         ("\ud800\u202e\u2028", r"\ud800\u202e\u2028"),
     ],
 )
-def test_what_is_not_printable_is_escaped(text: str, shown: str) -> None:
+def test_unprintable_characters_are_escaped(text: str, shown: str) -> None:
     assert plain(text) == shown and shown.isprintable()
 
 

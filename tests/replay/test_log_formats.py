@@ -64,7 +64,7 @@ LOSSES: dict[str, tuple[Callable[[Image], Image | None], int, str]] = {
 
 
 @pytest.mark.parametrize("name", LOSSES)
-def test_loss_is_told_by_the_exit_code(omnid: Command, tmp_path: Path, scene: Path, name: str) -> None:
+def test_the_exit_code_reports_loss(omnid: Command, tmp_path: Path, scene: Path, name: str) -> None:
     edit, code, line = LOSSES[name]
     taken = [edit(image) if image.pair % 4 == 1 else image for image in images(scene / "log.mcap")]
     log = save(tmp_path / "log.mcap", [image for image in taken if image is not None])

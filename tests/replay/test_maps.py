@@ -82,7 +82,7 @@ def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_aga
     assert "calibrated again" in result.err and omap.read_bytes() == before and "written" not in result.out
 
 
-def test_what_is_not_recognised_is_left_out_with_a_warning(
+def test_logs_that_are_not_recognised_are_left_out_with_a_warning(
     omnid: Command, scene: Path, elsewhere: Path, omap: Path, tmp_path: Path
 ) -> None:
     """No pose in the map is written, and no transform from it, as neither could say that the robot may be anywhere."""

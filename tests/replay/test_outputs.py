@@ -160,7 +160,7 @@ def test_rims_are_found_where_the_rig_has_no_masks(omnid: Command, tmp_path: Pat
         assert abs(seen.outer_px - exact.outer_px) < 4 and np.hypot(*np.subtract(seen.center, exact.center)) < 2
 
 
-def test_opens_no_bus_without_publish(omnid: Command, scene: Path) -> None:
+def test_a_replay_without_publish_opens_no_bus(omnid: Command, scene: Path) -> None:
     """A replay on a robot must not publish in the place of its daemon: without --publish it opens no bus."""
     result = omnid.replay(scene / "log.mcap", *FEW, "--set", 'bus.listen=["tcp/256.0.0.1:1"]', rig=scene / "rig.toml")
     assert result.code == 0

@@ -79,7 +79,7 @@ def test_a_wrong_input_is_refused_in_one_line(omnid: Command, scene: Path, folde
     assert sorted(folder.iterdir()) == before and not Path("-").exists()
 
 
-def test_uses_the_readable_part_of_a_truncated_log(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_the_readable_part_of_a_truncated_log_is_used(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log, tum = save(tmp_path / "log.mcap", images(scene / "log.mcap")), tmp_path / "est.txt"
     whole = log.read_bytes()
     log.write_bytes(whole[: len(whole) * 6 // 10])

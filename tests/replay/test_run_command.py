@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
 
-def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, course: Path) -> None:
+def test_the_run_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, course: Path) -> None:
     recording = ("record.enabled=true", "record.images_hz=0", f'record.folder="{tmp_path / "log"}"')
     words = patient("controller.deadlines.command_s=2", *recording)
     with robot(course, tmp_path, *words) as (daemon, operator, base):
@@ -60,7 +60,7 @@ def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, c
 
 
 @pytest.mark.hazard("H35")
-def test_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> None:
+def test_the_run_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> None:
     """Before the wheels turn, in one line, with exit code 2."""
     taken = images(scene / "log.mcap")
     exchanged = [replace(image, camera="upper" if image.camera == "lower" else "lower") for image in taken]
@@ -113,7 +113,7 @@ def test_a_camera_fails_and_recovers(tmp_path: Path, course: Path) -> None:
         assert daemon.end()[0] == 0
 
 
-def test_uses_the_attached_rig_and_ends_with_the_log() -> None:
+def test_the_run_uses_the_attached_rig_and_ends_with_the_log() -> None:
     port = free_port()
     command = [sys.executable, "-m", "omnid", "run", "--log", str(SAMPLE), "--once", "--pace", "20"]
     command += ["--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']

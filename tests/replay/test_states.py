@@ -58,7 +58,7 @@ def test_a_camera_without_images_for_a_second(omnid: Command, tmp_path: Path, sc
     assert errors_m(read_tum(tmp_path / "est"), Trajectory(truth.stamps_ns[seen], truth.T[seen])).max() < 0.02
 
 
-def test_two_seconds_of_darkness(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_pose_lost_in_two_seconds_of_darkness_is_found_again(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = images(scene / "log.mcap")
     before, last_pair = [p for p in taken if p.pair < 12], [p for p in taken if p.pair == 11]
     dark_images = [dark(p.later(1 + k)) for k in range(DARK_PAIRS) for p in last_pair]

@@ -26,7 +26,7 @@ def write(folder: Path, name: str = "misaligned", seed: int = 4, pairs: int = 3,
     return folder
 
 
-def test_same_seed_gives_same_bytes(tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     one = write(tmp_path / "a", seed=4) / "log.mcap"
     corridor.cache_clear()
     again, other = (write(tmp_path / n, seed=s) / "log.mcap" for n, s in (("b", 4), ("c", 5)))

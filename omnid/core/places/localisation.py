@@ -48,8 +48,8 @@ Array = NDArray[np.float64]
 # Set by trial on development seeds, where a line gives no other reason.
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
-# Searches in a row: of so many without success, only new keyframes are searched for; of so many that odometry
-# contradicts, it has missed a motion, because right ones in worlds that repeat had 3.
+# After this number of searches in a row without success, only new keyframes are searched for. After this number of
+# recognitions in a row that odometry contradicts, odometry has missed a motion: without one there were 3.
 SEARCHES: Final = 10
 # Covariance in a map of which nothing has been recognised, m^2 and rad^2, because it may be a kilometre away in any
 # direction.
@@ -100,8 +100,8 @@ class Hypothesis:
 def consistent_hypotheses(kept: Iterable[Hypothesis], new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
     """Return the recognitions that agree with a new one, which is the last of them; none if there are too few.
 
-    Both must place the newer frame at the same pose in the map. Frames at one place count as one, unless they show
-    much.
+    Both must place the newer frame at the same pose in the map. Frames at one place count as one, unless they have
+    many inliers.
     """
     T_map_new, distinct = new.T_map_odom(poses) @ new.T_odom_rect, list[Hypothesis]()
     for one in (*kept, new):
@@ -115,7 +115,7 @@ def consistent_hypotheses(kept: Iterable[Hypothesis], new: Hypothesis, poses: Ma
 def _is_distinct(one: Hypothesis, others: list[Hypothesis]) -> bool:
     """True if a recognition counts besides others: it has many inliers, or its frame is apart from theirs.
 
-    Many count without motion, as a robot may be at rest.
+    Many inliers count without motion, as a robot may be at rest.
     """
     if one.place.inliers >= FAR.inliers:
         return True

@@ -1,4 +1,4 @@
-"""Recognition of places: a shortlist by thumbnails and votes, matches about a yaw, RANSAC, Gauss-Newton; what counts.
+"""Recognition of places: a shortlist by thumbnails and votes, matches about a yaw, RANSAC, Gauss-Newton.
 
 `PlaceSearch.find` is the algorithm for a frame in a map, `recognise` that for a frame and one keyframe.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import Keyframe
-from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED, gauss_newton, ransac
+from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED, GaussNewtonResult, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import FEATURES, Signature, Thumbnail, describe, signature_of, similarities
 from omnid.core.places.place_map import PlaceFeatures, PlaceLimits, PlaceMap
@@ -47,7 +47,7 @@ GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
 
 
 class Effort(NamedTuple):
-    """How far a search goes, and what it takes to count."""
+    """How many keyframes a search compares, and the support that a recognition needs."""
 
     voted: int  # most similar thumbnails whose features vote
     compared: int  # of these, those with most votes
@@ -72,8 +72,8 @@ class Recognition:
     matches: int
     sectors: int  # number of SECTORS that hold inliers
 
-    def has(self, effort: Effort) -> bool:
-        """True if its support is that which an effort asks for."""
+    def suffices(self, effort: Effort) -> bool:
+        """True if it has the support that an effort asks for."""
         return self.inliers >= effort.inliers and self.sectors >= effort.sectors
 
 
@@ -143,7 +143,7 @@ class PlaceSearch:
 
 
 def search(
-    here: PlaceFeatures,
+    frame: PlaceFeatures,
     known: Mapping[int, PlaceFeatures],
     poses: Mapping[int, Array],
     effort: Effort,
@@ -155,7 +155,7 @@ def search(
     vote, at most three near another one, so that a second, similar place is compared as well, although all
     neighbours of the first are more similar.
     """
-    voted = {id: votes(here, features, model.cylinder.width) for id, features in known.items()}
+    voted = {id: votes(frame, features, model.cylinder.width) for id, features in known.items()}
     found: dict[int, Recognition | None] = {}
     for id in sorted(known, key=lambda id: -voted[id][0]):
         if len(found) == effort.compared:
@@ -163,10 +163,10 @@ def search(
         neighbours = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < NEAR_M for other in found)
         if neighbours >= NEAR.compared:
             continue
-        place = found[id] = recognise(here, known[id], id, voted[id][1], model)
+        place = found[id] = recognise(frame, known[id], id, voted[id][1], model)
         if place is not None and place.inliers >= effort.enough:
             break
-    supported = [each for each in found.values() if each is not None and each.has(effort)]
+    supported = [each for each in found.values() if each is not None and each.suffices(effort)]
     best = max(supported, key=lambda each: each.inliers, default=None)
     for other in supported:
         assert best is not None
@@ -179,21 +179,21 @@ def search(
 
 
 def recognise(
-    here: PlaceFeatures, there: PlaceFeatures, id: int, yaw_rad: float, model: StereoModel
+    frame: PlaceFeatures, keyframe: PlaceFeatures, id: int, yaw_rad: float, model: StereoModel
 ) -> Recognition | None:
     """Return the pose of a frame among the features of a keyframe; None where they do not fit.
 
     yaw_rad: from the keyframe to the frame, roughly.
     """
-    if len(here.views) < 2 or len(there.views) < 2:
+    if len(frame.views) < 2 or len(keyframe.views) < 2:
         return None
     model, cylinder, baseline_m = replace(model, sigma_px=SIGMA_PX), model.cylinder, model.baseline_m
-    squared = distances(there, here)
-    points, views = triangulate(there.views.astype(float), cylinder, baseline_m), here.views.astype(float)
+    squared = distances(keyframe, frame)
+    points, views = triangulate(keyframe.views.astype(float), cylinder, baseline_m), frame.views.astype(float)
     # 1. Matches whose azimuths differ by about the yaw. Azimuth falls with the column, and a turn to the left moves the
     #    world to the right.
-    turned = there.views[:, 0] + np.float32(cylinder.focal_px * yaw_rad)
-    is_far = _columns_apart(turned, here.views[:, 0], cylinder.width) > YAW_WINDOW_RAD * cylinder.focal_px
+    turned = keyframe.views[:, 0] + np.float32(cylinder.focal_px * yaw_rad)
+    is_far = _columns_apart(turned, frame.views[:, 0], cylinder.width) > YAW_WINDOW_RAD * cylinder.focal_px
     a, b = mutual_nearest(np.where(is_far, np.float32(np.inf), squared), RATIO)
     if len(a) < MIN_MATCHES:
         return None
@@ -201,37 +201,37 @@ def recognise(
     T_rect_place, is_inlier = ransac(points[a], views[b], model, np.random.default_rng(id), THRESHOLD_PX)
     if is_inlier.sum() < MIN_MATCHES:
         return None
-    first, _, _ = _fit(points[a[is_inlier]], views[b[is_inlier]], T_rect_place, model)
+    first = _fit(points[a[is_inlier]], views[b[is_inlier]], T_rect_place, model).T
     # 3. The pose by the matches near the views that this one predicts, also those that are similar to others.
     predicted = view(se3.apply(first, points), cylinder, baseline_m).astype(np.float32)
     is_far = squared > LARGEST_SQUARED
-    is_far |= _columns_apart(predicted[:, 0], here.views[:, 0], cylinder.width) > THRESHOLD_PX
-    is_far |= (np.abs(here.views[None, :, 1:] - predicted[:, None, 1:]) > THRESHOLD_PX).any(axis=2)
+    is_far |= _columns_apart(predicted[:, 0], frame.views[:, 0], cylinder.width) > THRESHOLD_PX
+    is_far |= (np.abs(frame.views[None, :, 1:] - predicted[:, None, 1:]) > THRESHOLD_PX).any(axis=2)
     a2, b2 = mutual_nearest(np.where(is_far, np.float32(np.inf), squared))
     if len(a2) < MIN_MATCHES:
         return None
-    T, covariance, errors = _fit(points[a2], views[b2], first, model)
+    fit = _fit(points[a2], views[b2], first, model)
     # 4. Its support.
-    kept = errors < OUTLIER_SQUARED
+    kept = fit.squared < OUTLIER_SQUARED
     count = int(kept.sum())
     if count < MIN_MATCHES:
         return None
     azimuth = np.floor(views[b2[kept], 0] * (SECTORS / cylinder.width)).astype(int) % SECTORS
-    covariance = CORRELATED * max(1.0, float(errors[kept].mean()) / views.shape[1]) * covariance + FLOOR
-    return Recognition(id, se3.inverse(T), covariance, count, len(a), len(np.unique(azimuth)))
+    scale = CORRELATED * max(1.0, float(fit.squared[kept].mean()) / views.shape[1])
+    covariance = scale * fit.covariance + FLOOR
+    return Recognition(id, se3.inverse(fit.T), covariance, count, len(a), len(np.unique(azimuth)))
 
 
-def _fit(points: Array, views: Array, T: Array, model: StereoModel) -> tuple[Array, Array, Array]:
-    """Return the pose T_curr_ref that explains the views (N, 3), its covariance, and the squared errors (N,)."""
+def _fit(points: Array, views: Array, T: Array, model: StereoModel) -> GaussNewtonResult:
+    """Return the pose T_curr_ref that explains the views (N, 3), from a start T."""
     spread = point_covariance(points, model.cylinder, model.baseline_m, model.sigma_px)
-    result = gauss_newton(points, spread, views, T, model)
-    return result.T, result.covariance, result.squared
+    return gauss_newton(points, spread, views, T, model)
 
 
 def mutual_nearest(squared: Floats, ratio: float = np.inf) -> tuple[Indices, Indices]:
     """Return rows and columns (M,) of the elements of squared distances (N, K) that are the least of both.
 
-    Infinite ones are none. ratio: to the second least of the row, at most.
+    Infinite elements match none. ratio: largest ratio of a distance to the second least of its row.
     """
     best, rows = squared.argmin(axis=1), np.arange(len(squared))
     nearest, second = squared[rows, best], np.partition(squared, 1, axis=1)[:, 1]
@@ -252,21 +252,20 @@ def _columns_apart(a: Floats, b: Floats, width: int) -> Floats:
     return np.asarray(np.abs(apart - np.float32(width) * np.rint(apart / np.float32(width))))
 
 
-def votes(here: PlaceFeatures, there: PlaceFeatures, width: int) -> tuple[int, float]:
-    """Return how many features of a frame have a match in a keyframe at one yaw, and that yaw [rad].
+def votes(frame: PlaceFeatures, keyframe: PlaceFeatures, width: int) -> tuple[int, float]:
+    """Return how many features of a frame have a match in a keyframe at one yaw from keyframe to frame, and it [rad].
 
-    It is that from the keyframe to the frame; width: columns of the panorama. Of places that are not the same, the
-    matches are few, and their yaws differ.
+    width: columns of the panorama. Different places have few matches, and these differ in yaw.
     """
-    if len(there.views) < 2 or not len(here.views):
+    if len(keyframe.views) < 2 or not len(frame.views):
         return 0, 0.0
-    here = here.first(FEATURES // 3)  # evenly spread, the strongest ones
-    squared = distances(here, there)
+    frame = frame.first(FEATURES // 3)  # evenly spread, the strongest ones
+    squared = distances(frame, keyframe)
     best = squared.argmin(axis=1)
     nearest, second = np.partition(squared, 1, axis=1)[:, :2].T
     voting = np.flatnonzero(nearest < RATIO**2 * second)
     # A turn to the left moves the world to the right.
-    turned = (here.views[voting, 0] - there.views[best[voting], 0]) % width
+    turned = (frame.views[voting, 0] - keyframe.views[best[voting], 0]) % width
     bins = 3 * SECTORS  # of the yaw angle; three neighbours count together
     counts = np.bincount((turned * (bins / width)).astype(np.intp) % bins, minlength=bins)
     together = counts + np.roll(counts, 1) + np.roll(counts, -1)
@@ -281,9 +280,10 @@ def motion_between(a: Array, b: Array) -> tuple[float, float]:
 
 
 class Relocaliser:
-    """After a break odometry finds its pose among its own newest keyframes, as a place is recognised.
+    """Finds the pose of odometry after a break among its own newest keyframes, as a place is recognised.
 
-    Keep the newest keyframes, as many as a search compares, and find the pose of a frame relative to them."""
+    It keeps as many keyframes as a search compares.
+    """
 
     def __init__(self, model: StereoModel) -> None:
         self._model = replace(model, cylinder=model.cylinder.full_turn)  # Columns of features are those of a full turn.
@@ -307,13 +307,13 @@ class Relocaliser:
     def locate(self, frame: StereoFrame) -> PoseEstimate | None:
         """Return the pose with the most inliers, with the complete covariance; None where no keyframe is recognised."""
         # 1. Describe the frame, and the keyframes that no search has described before.
-        here = describe(frame)
+        features = describe(frame)
         self._features = {kept.seq: self._features.get(kept.seq) or describe(kept) for kept, _ in self._kept}
         # 2. Search it among them, as in the map of places.
         keyframes = {keyframe.seq: keyframe for _, keyframe in self._kept}
         poses = {seq: keyframe.T_odom_rect for seq, keyframe in keyframes.items()}
         effort = NEAR._replace(compared=len(keyframes))
-        best = search(here, self._features, poses, effort, self._model)
+        best = search(features, self._features, poses, effort, self._model)
         if best is None:
             return None
         A = se3.adjoint(se3.inverse(best.T_place_rect))

@@ -1,4 +1,4 @@
-"""Brightness and noise of panoramas: dim images are made brighter, and the noise is measured that thresholds follow.
+"""Brightness and noise of panoramas: dim images are made brighter, and the noise is measured, which sets thresholds.
 
 Two images are only compared at the same brightness. The exposure of a camera changes from image to image and differs
 between the two cameras; in the dark both are dim. So an image below a level is multiplied up to it, and the dimmer one

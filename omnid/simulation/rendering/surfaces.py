@@ -36,6 +36,7 @@ AMBIENT, DIFFUSE = 0.72, 0.28
 
 # 1. Textures.
 def grey_of(values: Array | NDArray[np.float32]) -> Texture:
+    """Return values (H, W) as whole grey levels."""
     rounded = np.rint(values)
     return np.clip(rounded, 0, 255, out=rounded).astype(np.uint8)
 

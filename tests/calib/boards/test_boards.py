@@ -56,7 +56,7 @@ def errors_px(found: Array, truth: Array) -> Array:
         (FlawedSensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 0.5),
     ],
 )
-def test_finds_boards_on_all_sides(sensor: Sensor, contrast: tuple[float, float], limit_px: float) -> None:
+def test_boards_are_found_on_all_sides(sensor: Sensor, contrast: tuple[float, float], limit_px: float) -> None:
     for seed, T in enumerate(poses(3)):
         rendered = RENDERER.render_board(T, seed=seed, sensor=sensor, contrast=contrast)
         view = find_board(rendered.image, BOARD)
@@ -65,7 +65,7 @@ def test_finds_boards_on_all_sides(sensor: Sensor, contrast: tuple[float, float]
         assert np.nanmedian(off) < limit_px / 2 and np.nanpercentile(off, 90) < limit_px, seed
 
 
-def test_finds_a_board_through_a_fisheye_lens() -> None:
+def test_a_board_is_found_through_a_fisheye_lens() -> None:
     camera = OcamCamera((-180.0, 0.0, 1.2e-3), (238.0, 241.0), (1.0, 0.0, 0.0), (480, 480), "direct")
     mask = Mask(camera.center, 0.0, 232.0)
     T = board_poses_around_camera(camera, BOARD, mask, 1, distance_m=(0.2, 0.3), elevation_deg=(120, 150))[0]
@@ -96,7 +96,7 @@ def test_a_board_of_another_size_is_not_found() -> None:
 
 
 @pytest.mark.slow
-def test_finds_no_board_in_images_without_one() -> None:
+def test_images_without_a_board_give_none() -> None:
     rng = np.random.default_rng(3)
     noise = rng.integers(0, 255, (300, 300)).astype(np.uint8)
     stripes = np.where(np.arange(300) // 10 % 2, 40, 200).astype(np.uint8)
@@ -114,14 +114,14 @@ def test_finds_no_board_in_images_without_one() -> None:
 
 
 @pytest.mark.slow
-def test_finds_the_board_in_all_ten_real_images(shared_data: Path) -> None:
+def test_the_board_is_found_in_all_ten_real_images(shared_data: Path) -> None:
     for number in range(10):
         image = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)
         view = find_board(image.astype(np.uint8), Board(6, 7, 0.03))
         assert view is not None and np.isfinite(view).all(), number
 
 
-def test_finds_a_board_whose_outer_squares_are_cut_off_by_the_image() -> None:
+def test_a_board_whose_outer_squares_the_image_cuts_off_is_found() -> None:
     sheet = cv2.resize(board_texture(BOARD), None, fx=3, fy=3, interpolation=cv2.INTER_AREA)
     cut = round(3 * SQUARE_PX * 1.65)
     image = np.asarray(cv2.GaussianBlur(sheet[cut:-cut, cut:-cut], (0, 0), 1.0), np.uint8)
@@ -141,7 +141,7 @@ GRID = AprilGrid(4, 3, 0.06, 0.3)
 
 
 @pytest.mark.parametrize(("hidden", "least", "most"), [(0.0, 0.7, 1.0), (0.5, 0.25, 0.55)])
-def test_finds_the_visible_corners_in_a_mirror(hidden: float, least: float, most: float) -> None:
+def test_the_visible_corners_are_found_in_a_mirror(hidden: float, least: float, most: float) -> None:
     T = board_poses_around_camera(MOUNTED.camera, frame_board(GRID), GRID_MASK, 1, seed=3, distance_m=(0.25, 0.3))[0]
     made = render_april_grid(MOUNTED, GRID, T, seed=1, sensor=Sensor(noise_sigma=2.0), hidden=hidden)
     view = find_april_grid(made.image, GRID)
@@ -165,6 +165,6 @@ def test_tags_elsewhere_than_on_the_grid_are_no_grid() -> None:
         ((30, 30, 0.08, 0.3), "expected 1 to 587 tags, .* found 30x30"),
     ],
 )
-def test_refuses_impossible_grids(sizes: tuple[int, int, float, float], words: str) -> None:
+def test_impossible_grids_are_refused(sizes: tuple[int, int, float, float], words: str) -> None:
     with pytest.raises(CalibError, match=words):
         AprilGrid(*sizes)

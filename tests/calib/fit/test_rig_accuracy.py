@@ -64,7 +64,7 @@ def test_a_rotation_about_every_axis_is_estimated_and_corrected(
     assert again.lower is wrong.lower and again.topics == rig.topics
 
 
-def test_distinguishes_a_shifted_viewpoint_from_a_tilt(rig: Rig, around: Array) -> None:
+def test_a_shifted_viewpoint_is_distinguished_from_a_tilt(rig: Rig, around: Array) -> None:
     R = rig.T_rect_rig[:3, :3]
     T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
     T_rig_upper[:3, 3] -= R.T @ np.array([0.02, -0.01, 0.0]) * rig.baseline_m

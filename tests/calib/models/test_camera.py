@@ -67,7 +67,7 @@ def test_project_inverts_lift_at_any_distance(camera: OmniCamera) -> None:
 
 
 @pytest.mark.parametrize("name", TURNING)
-def test_no_pixel_is_that_of_two_rays(name: str) -> None:
+def test_two_rays_never_share_a_pixel(name: str) -> None:
     camera = TURNING[name]
     rays = np.random.default_rng(2).normal(size=(5000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -133,15 +133,15 @@ def test_lens_projections_equal_the_equations() -> None:
     np.testing.assert_allclose(pixel, [900 + 300 * radius * 0.6, 950 - 310 * radius * 0.8], rtol=0, atol=1e-9)
 
 
-def test_projects_the_axis_to_the_centre_and_invalid_points_to_nan(camera: OmniCamera) -> None:
+def test_the_axis_is_projected_to_the_centre_and_invalid_points_to_nan(camera: OmniCamera) -> None:
     axis = camera.lift(np.array([camera.center]))
     assert abs(axis[0, 2]) == pytest.approx(1, abs=1e-6)
     np.testing.assert_allclose(camera.project(3 * axis), [camera.center], rtol=0, atol=1e-6)
-    nothing = np.array([[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], -3 * axis[0]])
+    invalid = np.array([[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], -3 * axis[0]])
     if isinstance(camera, EquirectangularCamera):  # it sees what is behind it
-        nothing = nothing[:3]
+        invalid = invalid[:3]
     with np.errstate(invalid="ignore"):  # numpy's own warnings of infinite points
-        assert np.isnan(camera.project(nothing)).any(axis=1).all()
+        assert np.isnan(camera.project(invalid)).any(axis=1).all()
         assert np.isnan(camera.lift(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).any(axis=1).all()
 
 
@@ -175,7 +175,7 @@ def board_in_camera(numbers: dict[str, Any], image: dict[str, Any], view: View) 
 
 @pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("view", ["mirror", "direct"])
-def test_reproduces_the_toolbox_errors(shared_data: Path, key: str, view: View) -> None:
+def test_the_model_reproduces_the_toolbox_errors(shared_data: Path, key: str, view: View) -> None:
     numbers = reference(shared_data, key)
     camera = parse_ocam(text(numbers), view)
     assert camera.size == (1024, 768)

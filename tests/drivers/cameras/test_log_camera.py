@@ -31,7 +31,7 @@ def test_the_images_are_those_of_the_log(scene: Path) -> None:
         assert frame.stamp_ns == pytest.approx(playback.epoch_ns() + since_ns, abs=1)
 
 
-def test_plays_forwards_and_backwards_at_even_intervals(scene: Path) -> None:
+def test_a_log_is_played_forwards_and_backwards_at_even_intervals(scene: Path) -> None:
     pace, open_end = 1000.0, threading.Event()
     playback = LogPlayback(scene / "log.mcap", pace=pace)
     lower, upper = (

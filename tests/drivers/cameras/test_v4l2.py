@@ -108,7 +108,7 @@ def two_webcams(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_finds_cameras_by_number_without_metadata_nodes(two_webcams: Path) -> None:
+def test_cameras_are_listed_by_number_without_metadata_nodes(two_webcams: Path) -> None:
     found = capture_devices(two_webcams)
     assert [(device.node, device.name) for device in found] == [
         ("/dev/video2", "HD Webcam"), ("/dev/video10", "HD Webcam"),
@@ -165,7 +165,7 @@ def test_auto_prefers_a_format_without_decoding_if_it_is_fast_enough(
         ({"rate_hz": 60.0}, r"auto 1280x960 at 60 Hz is not offered; .*MJPG 1280x960 at 30 Hz"),
     ],
 )
-def test_refuses_other_modes_and_names_what_the_device_sets(
+def test_another_mode_is_refused_and_that_of_the_device_is_named(
     tmp_path: Path, fields: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(DriverError, match=message) as caught:
@@ -372,7 +372,7 @@ def test_broken_buffers_are_errors_and_not_drops(buffers: Buffers, broken: dict[
 
 
 @pytest.mark.parametrize("flags", [0, 0x4000])
-def test_accepts_an_undeclared_clock_with_one_warning(buffers: Buffers, flags: int) -> None:
+def test_a_camera_with_an_undeclared_clock_is_accepted_with_one_warning(buffers: Buffers, flags: int) -> None:
     expected = [START_NS, START_NS + PERIOD_NS]
     assert [buffers.stamp(stamp_ns, stamp_ns + DELAY_NS, flags) for stamp_ns in expected] == expected
     assert [level for level, _ in buffers.events] == [logging.WARNING]
@@ -380,7 +380,7 @@ def test_accepts_an_undeclared_clock_with_one_warning(buffers: Buffers, flags: i
 
 
 @pytest.mark.parametrize("stamp_ns", [0, START_NS - 11 * 10**9, 1_700_000_000 * 10**9])
-def test_replaces_stamps_of_another_clock_by_the_arrival(buffers: Buffers, stamp_ns: int) -> None:
+def test_stamps_of_another_clock_are_replaced_by_the_arrival(buffers: Buffers, stamp_ns: int) -> None:
     assert buffers.stamp(stamp_ns, START_NS) == START_NS
     assert buffers.state.restamped == 1
 
@@ -394,7 +394,7 @@ def test_stamps_increase_strictly(buffers: Buffers) -> None:
     assert buffers.state.restamped == 2
 
 
-def test_images_of_a_clock_that_fell_back_are_dated_by_their_arrival_for_good(buffers: Buffers) -> None:
+def test_images_of_a_clock_that_fell_back_are_dated_by_their_arrival_permanently(buffers: Buffers) -> None:
     found = []
     for number in range(300):
         taken_ns = START_NS + PERIOD_NS * number

@@ -182,7 +182,7 @@ def test_omnids_own_recordings_of_one_run_are_parts(tmp_path: Path) -> None:
         (MAGIC + bytes(4), "is cut or corrupt after byte 8 of 12$"),
     ],
 )
-def test_refuses_other_files_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:
+def test_other_files_are_refused_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:
     path = tmp_path / "log.mcap"
     path.write_bytes(data)
     with pytest.raises(DriverError, match=message) as caught:
@@ -190,7 +190,7 @@ def test_refuses_other_files_in_one_line(tmp_path: Path, data: bytes, message: s
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_refuses_unreadable_paths(tmp_path: Path) -> None:
+def test_unreadable_paths_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DriverError, match="No such file"):
         LogReader(tmp_path / "nowhere.mcap")
     with pytest.raises(DriverError, match="none"):
@@ -361,7 +361,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
 # Attachments and topics
 
 
-def test_ignores_a_corrupt_attachment_and_a_corrupt_summary(tmp_path: Path) -> None:
+def test_a_corrupt_attachment_and_a_corrupt_summary_are_ignored(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2), [("rig.toml", b"version = 1"), ("other", b"2")])
     path.write_bytes(path.read_bytes().replace(b"version = 1", b"version = 7"))
     assert LogReader(path).attachments() == {"other": b"2"}

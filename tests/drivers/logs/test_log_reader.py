@@ -144,7 +144,7 @@ CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
         ("/lower/upsampled", "/upper/down_sampled"),
     ],
 )
-def test_identifies_cameras_by_name(tmp_path: Path, lower: str, upper: str) -> None:
+def test_cameras_are_identified_by_name(tmp_path: Path, lower: str, upper: str) -> None:
     reader = LogReader(write_log(tmp_path / "log.mcap", [CHATTER, *pairs(2, lower, upper)]))
     assert reader.topics == {"lower": lower, "upper": upper}
     assert [frame.camera for frame in reader.frames()] == ["lower", "upper"] * 2
@@ -246,7 +246,7 @@ def test_the_rates_are_those_of_the_base() -> None:
         (ODOMETRY, imu((0.0, 0.0, 0.0)), "truncated or invalid"),
     ],
 )
-def test_rates_that_are_none_are_refused(kind: str, data: bytes, reason: str) -> None:
+def test_invalid_rates_are_refused(kind: str, data: bytes, reason: str) -> None:
     with pytest.raises(FrameDecodeError, match=reason):
         sample(kind, data)
 
@@ -356,7 +356,7 @@ def test_headers_that_cannot_be_used_are_refused_and_the_setting_is_named(tmp_pa
     ],
     ids=["of one camera", "of one image"],
 )
-def test_where_headers_are_not_set_the_times_of_logging_are_used(tmp_path: Path, stamp: Times, line: str) -> None:
+def test_times_of_logging_are_used_where_headers_are_not_set(tmp_path: Path, stamp: Times, line: str) -> None:
     frames, warnings = stamped(write_log(tmp_path / "log.mcap", entries(stamp)))
     assert shown(frames) == AS_TAKEN and len(warnings) == 1 and re.search(line, warnings[0])
     steps = np.diff([frame.stamp_ns for frame in frames if frame.camera == "lower"])

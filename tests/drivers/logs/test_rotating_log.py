@@ -99,7 +99,7 @@ def test_a_new_file_begins_by_size_and_by_age(bench: Callable[..., Bench], rotat
             assert [a.name for a in make_reader(opened).iter_attachments()] == ["rig.toml"]
 
 
-def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> None:
+def test_the_oldest_files_are_deleted_and_counted(bench: Callable[..., Bench]) -> None:
     recording = bench(replace(ROOMY, file_s=1.0, file_bytes=100_000, keep_bytes=180_000))
     strangers = ["notes.txt", "robot_20200101T000000Z_001.mcap.bak", "other_20200101T000000Z_001.mcap"]
     recording.folder.mkdir()

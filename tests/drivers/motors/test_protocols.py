@@ -141,14 +141,14 @@ def test_no_other_line_is_taken_for_the_answer(body: bytes) -> None:
         result(LineProtocol(DRIVE).drive(STOP), line(body))
 
 
-def test_detects_every_changed_byte() -> None:
+def test_every_changed_byte_is_detected() -> None:
     whole = line(b"S,0,250,-1500,125,12600,7,1")
     for i in range(len(whole) - 1):
         for value in set(range(256)) - {whole[i], whole[i] ^ 0x20}:  # hexadecimal digits may be small letters
             assert decode(whole[:i] + bytes([value]) + whole[i + 1 :]) is None
 
 
-def test_refuses_a_command_beyond_the_range_of_its_line() -> None:
+def test_a_command_beyond_the_range_of_its_line_is_refused() -> None:
     with pytest.raises(DriverError, match="velocity 12000 is outside"):
         next(LineProtocol(replace(DRIVE, max_wheel_mps=20.0)).drive(VelocityCommand(0, 12.0, 0.0, 0.0)))
 

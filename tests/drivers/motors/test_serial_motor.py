@@ -130,7 +130,7 @@ class FixedWatchdog(SimulatedLine):
         return encode("A", 1000) if reply.startswith(b"$A") else reply
 
 
-def test_verifies_the_watchdog_in_force() -> None:
+def test_the_driver_verifies_the_watchdog_in_force() -> None:
     with (
         contextlib.closing(PtyMotor(FixedWatchdog())) as simulated,
         pytest.raises(DriverError, match="500 ms requested, 1000 ms in force"),

@@ -64,7 +64,7 @@ def test_motion_between_the_exposures_is_no_drift(tmp_path: Path, capsys: pytest
         ((0.0, 0.0, 11.0), RigState.BROKEN),
     ],
 )
-def test_measures_turns_about_every_axis(drive: Path, pairs: list[FramePair], turn_deg: Turn, state: RigState) -> None:
+def test_every_axis_is_measured(drive: Path, pairs: list[FramePair], turn_deg: Turn, state: RigState) -> None:
     found = check_rotated(drive, pairs, turn_deg).finding
     assert found.state is state and found.drift is not None
     assert np.rad2deg(found.drift.turn) == pytest.approx(turn_deg, abs=0.05 if state is not RigState.BROKEN else 0.1)

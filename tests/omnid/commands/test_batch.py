@@ -60,7 +60,7 @@ def replays_of(log: Path) -> list[int]:
     return found
 
 
-def test_results_are_those_of_single_runs_and_what_is_done_is_not_done_again(tmp_path: Path) -> None:
+def test_results_are_those_of_single_runs_and_logs_are_replayed_once(tmp_path: Path) -> None:
     good, out = short_log(tmp_path / "logs" / "day1" / "log.mcap"), tmp_path / "out"
     (tmp_path / "logs" / "broken.mcap").write_text("no log")
     outputs = ("--tum", tmp_path / "est.txt", "--cloud", tmp_path / "cloud.ply", "--plan", tmp_path / "plan.png")

@@ -91,7 +91,7 @@ def turn_off_deg(rig: Rig) -> float:
 
 
 @pytest.mark.slow
-def test_recovers_cameras_and_rig_from_images(many: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_give_the_true_cameras_and_rig(many: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, report = tmp_path / "rig.toml", tmp_path / "report.html"
     assert run(many, "-o", out, "--report", report, "--expected-baseline-mm", "180") == 0
     output = capsys.readouterr()
@@ -258,7 +258,7 @@ def kalibr(tmp_path: Path) -> Path:
     return tmp_path / "k.yaml"
 
 
-def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_kalibr_files_are_imported(kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert import_rig(kalibr, "-o", tmp_path / "rig.toml") == 0
     (line,) = capsys.readouterr().out.splitlines()
     assert "lower omni, upper omni, " in line
@@ -272,7 +272,7 @@ def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.Captu
         assert "--height-m: expected 0.1 to 10" in capsys.readouterr().err
 
 
-def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ocam_files_are_imported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.txt").write_text(OCAM)
     files = ["--lower", tmp_path / "c.txt", "--upper", tmp_path / "c.txt", "-o", tmp_path / "rig.toml"]
     assert import_rig(*files) == 2 and "--baseline METRES" in capsys.readouterr().err

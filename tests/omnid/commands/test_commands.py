@@ -66,7 +66,7 @@ def loaded(omnid: Command, *words: object, code: int = 0) -> Any:
     return json.loads(done.out)
 
 
-def test_results_of_a_replay_as_json(omnid: Command, scene: Path, tmp_path: Path) -> None:
+def test_the_results_of_a_replay_are_written_as_json(omnid: Command, scene: Path, tmp_path: Path) -> None:
     tum = tmp_path / "est.txt"
     words = ("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--inline", "--seconds", 0.75)
     first = loaded(omnid, *words, "--tum", tum)

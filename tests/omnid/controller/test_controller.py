@@ -196,7 +196,7 @@ def test_the_base_drives_on_where_an_answer_is_late(driving: Bench) -> None:
     assert driving.last.velocity_mps == 0.3 and driving.controller.state.reason == "" and driving.lines == []
 
 
-def test_slows_down_at_the_end_whatever_the_setpoint(driving: Bench) -> None:
+def test_the_base_slows_down_at_the_end_whatever_the_setpoint(driving: Bench) -> None:
     driving.controller.end()
     assert not driving.controller.is_at_rest
     slows_down(driving, lambda: send_both(driving))

@@ -75,7 +75,7 @@ def loaded(statement: str) -> list[str]:
     return names
 
 
-def test_loads_no_module_of_perception() -> None:
+def test_the_controller_loads_no_module_of_perception() -> None:
     modules = loaded("import omnid.controller.process")
     assert "omnid.controller.controller" in modules
     assert [name for name in modules if any(f"{name}.".startswith(f"{heavy}.") for heavy in HEAVY)] == []
@@ -201,7 +201,7 @@ def test_poses_and_setpoints_turn_the_wheels_and_each_tick_is_counted(robot: Rob
 
 @pytest.mark.hazard("H39")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGABRT])
-def test_survives_signals_that_end_the_daemon(robot: Robot, number: int) -> None:
+def test_the_controller_survives_signals_that_end_the_daemon(robot: Robot, number: int) -> None:
     robot.drive()
     os.kill(robot.pid, number)
     count = robot.link.statistics.state.sent
@@ -274,7 +274,7 @@ while True:
 
 
 @pytest.mark.hazard("H39")
-def test_slows_down_when_the_daemon_is_killed(tmp_path: Path) -> None:
+def test_the_base_slows_down_when_the_daemon_is_killed(tmp_path: Path) -> None:
     with contextlib.closing(Base(tmp_path)) as base:
         command = [sys.executable, "-c", OWNER, str(base.port)]
         with subprocess.Popen(command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}) as owner:

@@ -200,7 +200,7 @@ def run(copy: Path, cache: Path) -> list[str]:
 
 
 def test_the_first_program_compiles_and_others_read_until_a_file_is_edited(copy: Path) -> None:
-    """Also one that only the callee is in, which numba itself would not notice; the code of other files stays."""
+    """An edit of the callee counts, too, which numba itself would not notice; the code of other files stays."""
     cache = copy / "cache"
     with process_of(copy, cache) as one, process_of(copy, cache) as other:
         outputs = [program.communicate(timeout=300)[0].splitlines() for program in (one, other)]

@@ -54,7 +54,7 @@ def run(law: ExposureLaw, sensor: Sensor, seconds: float, at_s: float = 0.0) -> 
 
 @pytest.mark.parametrize("light", [0.02, 0.4, 8.0])
 @pytest.mark.parametrize("sensor", [{}, {"gamma": 0.45}, {"linear_gain": True}])
-def test_brings_scenes_into_the_middle_and_rests(light: float, sensor: dict[str, float]) -> None:
+def test_the_law_brings_scenes_into_the_middle_and_rests(light: float, sensor: dict[str, float]) -> None:
     camera, law = Sensor(light, **sensor), ExposureLaw(LAW_RANGES, START, 20_000)
     steps = run(law, camera, 20.0)
     level = camera.levels(law.setting)
@@ -72,7 +72,7 @@ def test_the_exposure_rises_to_its_limit_before_the_gain_and_the_gain_falls_firs
     assert brighter and brighter[0].gain < steps[-1].gain and brighter[0].exposure_us == 20_000
 
 
-def test_multiples_of_the_lamps_period() -> None:
+def test_exposures_are_multiples_of_the_lamps_period() -> None:
     law = ExposureLaw(LAW_RANGES, START, 25_000, flicker_us=10_000.0)
     times = {setting.exposure_us for _, setting in run(law, Sensor(0.2), 20.0)}
     assert law.setting.exposure_us in (10_000, 20_000) and all(time % 10_000 == 0 or time < 10_000 for time in times)
@@ -172,7 +172,7 @@ def test_the_status_says_what_to_do_where_it_is_too_dark_or_too_bright(area: Use
      (CamerasConfig(), (RANGES, None), "no exposure time to set"),
      (CamerasConfig(), (RANGES, ExposureRanges(ValueRange(300_000, 400_000))), "no value in common")],
 )  # fmt: skip
-def test_leaves_the_exposure_to_the_cameras_and_says_why(
+def test_the_exposure_is_left_to_the_cameras_and_the_status_says_why(
     area: UsefulArea, config: CamerasConfig, ranges: tuple[ExposureRanges | None, ExposureRanges | None], words: str
 ) -> None:
     robot = Robot(area, 0.5, config, ranges)
@@ -192,7 +192,7 @@ def test_cameras_that_refuse_an_exposure_get_their_own_back(area: UsefulArea) ->
         assert one.exposure is not None and one.exposure.request is not None and one.exposure.request.setting is None
 
 
-def test_measures_where_the_panorama_is(rig: Rig, area: UsefulArea) -> None:
+def test_levels_are_measured_where_the_panorama_is(rig: Rig, area: UsefulArea) -> None:
     pair = []
     for mounted in (rig.lower, rig.upper):
         image = np.full((240, 240), 255, np.uint8)

@@ -66,9 +66,9 @@ def publish_until_it_ends(
 def test_listen_shows_the_robot_and_ends_with_a_signal() -> None:
     endpoint = free_endpoint()
     rover = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
-    with rover as bus, running([*OMNID, "listen", "--robot", "rover", "--connect", endpoint]) as it:
-        out, err = publish_until_it_ends(bus, it, signal.SIGTERM)
-    assert it.returncode == 0 and err == "" and "\x1b" not in out
+    with rover as bus, running([*OMNID, "listen", "--robot", "rover", "--connect", endpoint]) as listening:
+        out, err = publish_until_it_ends(bus, listening, signal.SIGTERM)
+    assert listening.returncode == 0 and err == "" and "\x1b" not in out
     last = out.splitlines()[-1]
     assert last.startswith("rover: tracking  ") and "x +0.500 y +0.250" in last
 
@@ -76,9 +76,9 @@ def test_listen_shows_the_robot_and_ends_with_a_signal() -> None:
 def test_a_wrong_name_is_reported() -> None:
     endpoint = free_endpoint()
     idle = contextlib.closing(Bus(BusConfig(listen=(endpoint,), robot="hall/one")))
-    with idle, running([*OMNID, "listen", "--connect", endpoint, "--seconds", 0.5]) as it:
-        out, _ = it.communicate(timeout=DEADLINE_S)
-    assert it.returncode == 1 and out == "omnid: no pose yet: no robot of this name is there\n"
+    with idle, running([*OMNID, "listen", "--connect", endpoint, "--seconds", 0.5]) as listening:
+        out, _ = listening.communicate(timeout=DEADLINE_S)
+    assert listening.returncode == 1 and out == "omnid: no pose yet: no robot of this name is there\n"
 
 
 def received_message(number: int) -> ReceivedMessage:

@@ -110,7 +110,7 @@ def test_all_positions_are_aligned_where_that_is_asked_for() -> None:
 
 
 @pytest.mark.skipif(shutil.which("evo_ape") is None, reason="evo is not on PATH: pipx install evo==1.38.1")
-def test_same_numbers_as_evo(tmp_path: Path) -> None:
+def test_the_errors_equal_those_of_evo(tmp_path: Path) -> None:
     truth = spline()
     files = [write(tmp_path / "truth.txt", truth), write(tmp_path / "estimate.txt", drifted(truth))]
     metrics = evaluate(read_tum(files[1]), read_tum(files[0]))

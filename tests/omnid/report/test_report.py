@@ -140,7 +140,7 @@ def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> No
         assert words in text, words
 
 
-def test_what_is_invalid_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_invalid_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     far = np.eye(4)
     far[0, 3] = 1e12
     entries = [*run(10), (at(10), *odom(10, far)[1:]), (at(11), *odom(5, np.eye(4))[1:]), odom(12)]

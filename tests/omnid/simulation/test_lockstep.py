@@ -1,4 +1,4 @@
-"""A robot that drives in lock-step: reproducible to the byte, and what it is told changes what it sees.
+"""A robot that drives in lock-step: reproducible to the byte, and its commands change its images.
 
 The base stops before what parts of images that are dead or blind no longer show, and its map calls nothing free where a
 low box or a pole stands.
@@ -70,7 +70,7 @@ def run() -> SimulatedRun:
     return drive(1)
 
 
-def test_same_seed_gives_the_same_bytes(run: SimulatedRun) -> None:
+def test_the_same_seed_gives_the_same_bytes(run: SimulatedRun) -> None:
     again, other = drive(1), drive(2, 1.2)
     assert run.ticks == again.ticks and run.T_odom_base.tobytes() == again.T_odom_base.tobytes()
     # The other seed's first second, before the run ends.
@@ -184,7 +184,7 @@ def test_the_floor_that_was_driven_is_free_and_a_low_box_and_a_white_pole_beside
     assert in_pole.any() and (found.cells[in_pole] == UNKNOWN).all()
 
 
-# `omnid simulate` in its own time: a daemon that is slowed down loses nothing, and drives where it is told to.
+# `omnid simulate` in its own time: a daemon that is slowed down loses nothing, and reaches its goal.
 STOPPED_S, RUNNING_S = 0.6, 0.3  # longer than the deadlines of poses and commands; share of a computer that is left
 NEAR_M = 0.05
 GOAL = ("0.3", "0.05")
@@ -237,7 +237,7 @@ def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, caps
     assert status.value(WHEELS, Key.ARMED) == "1"
     # 2. Its time went more slowly than that on the wall.
     assert 0 < float(status.value(SIMULATION, Key.REAL_TIME_FACTOR)) <= 1.0
-    # 3. The robot stands at the goal, which is no drive that was cut short.
+    # 3. The robot rests at the goal, and its drive was not cut short.
     assert "the command is stale" not in log
     assert code == 0 and "contacts with obstacles: 0" in log
     assert math.dist(read_tum(truth).T[-1, :2, 3], tuple(map(float, GOAL))) < NEAR_M

@@ -1,7 +1,7 @@
 """A stateful property test of planner, routes and collision monitor: random events, and an oracle of what may move.
 
 The real navigation stage drives the real control law; the oracle knows the requests, their answers and the states that
-the stage tells. Without a goal that somebody asked for, or a living command of a person, the wheels only slow down.
+the stage reports. Without a goal that somebody asked for, or a living command of a person, the wheels only slow down.
 """
 
 from __future__ import annotations

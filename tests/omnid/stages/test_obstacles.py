@@ -145,7 +145,7 @@ def test_floor_between_edges_is_free_where_the_rig_states_its_height_and_nothing
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), [(0.15, 0.2), (-0.15, -0.1)])
-def test_what_is_known_stays_at_its_place_in_odom_as_the_base_moves(x_m: float, y_m: float) -> None:
+def test_known_cells_stay_at_their_place_in_odom_as_the_base_moves(x_m: float, y_m: float) -> None:
     """A low thing nearer than the floor in view, one beside the base, and the free floor too near to be seen."""
     base, pairs = (
         Standing(HEIGHT_M),

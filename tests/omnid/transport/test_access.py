@@ -205,7 +205,7 @@ def test_behind_a_router_no_robot_speaks_for_another(site: Path) -> None:
             visitor(site, endpoint, "eve", "hall/one")
 
 
-def test_drops_messages_that_others_publish_under_the_robots_name() -> None:
+def test_messages_of_others_under_the_robots_name_are_dropped() -> None:
     """A forged pose that is sent to the robot is not forwarded to its subscribers."""
     endpoint, poses = free_endpoint(), list[bytes]()
     with (

@@ -157,7 +157,7 @@ def listening() -> set[str]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs Linux's /proc")
-def test_opens_the_given_endpoint_only() -> None:
+def test_the_bus_opens_the_given_endpoint_only() -> None:
     before, endpoint = listening(), free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))):
         assert listening() - before == {f"0100007F:{int(endpoint.rsplit(':')[-1]):04X}"}
@@ -252,7 +252,7 @@ def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
     assert len(gids) == 1 and numbers == list(range(numbers[0], numbers[0] + 3))
 
 
-def test_receives_a_twist_from_ros() -> None:
+def test_the_bus_receives_a_twist_from_ros() -> None:
     endpoint, received = free_endpoint(), []
     key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:

@@ -58,7 +58,7 @@ SCAN = scan_cdr(STAMP_NS, "base_link", RANGES, SIGMA, (0.1, 6.0))
 DIAGNOSTICS = codec.diagnostics_cdr(STAMP_NS, STATUSES)
 
 
-def test_what_others_read_is_as_ros_lays_it_out() -> None:
+def test_messages_for_other_programs_have_the_layout_of_ros() -> None:
     """Transforms, headings, moving obstacles and a cloud without points, by rosbags: omnid does not read them."""
 
     def read(schema: str, payload: bytes) -> Any:
@@ -75,11 +75,11 @@ def test_what_others_read_is_as_ros_lays_it_out() -> None:
     assert [field.name for field in moving.fields] == list(MOVING_FIELDS)
     row = moving.data.view("<f4").reshape(3, 8)[2]
     np.testing.assert_allclose(row, [1.5, -0.25, 0, 0, 0.75, 0.25, 0.2, 0.5], rtol=1e-6)
-    nothing = codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0))
-    assert (read(codec.POINT_CLOUD_SCHEMA, nothing).width, decode_cloud(nothing).points.shape) == (0, (0, 3))
+    empty = codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0))
+    assert (read(codec.POINT_CLOUD_SCHEMA, empty).width, decode_cloud(empty).points.shape) == (0, (0, 3))
 
 
-def test_what_is_decoded_is_what_was_encoded() -> None:
+def test_decoded_messages_equal_the_encoded_ones() -> None:
     report = decode_diagnostics(DIAGNOSTICS)
     assert report.stamp_ns == STAMP_NS and [status.name for status in report.statuses] == ["a", "b"]
     assert (report.value("a", "k"), report.value("b", "k"), report.value("c", "k")) == ("v", "", "")
@@ -151,7 +151,7 @@ def overwritten(offset: int, value: bytes) -> bytes:
         ),
     ],
 )
-def test_what_is_no_message_is_refused(make: Callable[[], object], words: str) -> None:
+def test_malformed_messages_are_refused(make: Callable[[], object], words: str) -> None:
     with pytest.raises(OmnidError, match=words):
         make()
 

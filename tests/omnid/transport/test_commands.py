@@ -315,7 +315,7 @@ def worse(rng: random.Random, good: bytes) -> bytes:
 
 
 @pytest.mark.hazard("H09")
-def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands) -> None:
+def test_a_thousand_damaged_payloads_are_counted(accepted: AcceptedCommands) -> None:
     """None raises, each is counted, and numbers of payloads that are still valid are finite and in range."""
     rng = random.Random(1)
     for _ in range(1000):
@@ -442,7 +442,7 @@ def test_a_goal_of_another_time_is_refused_and_a_halt_is_not(age_s: float) -> No
 @pytest.mark.parametrize(
     ("topic", "text"), [("route", "repeat hall"), ("route", "teach hall"), ("navigation", "resume")]
 )
-def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(topic: str, text: str) -> None:
+def test_commands_that_begin_a_motion_need_a_stamp_and_those_that_end_one_do_not(topic: str, text: str) -> None:
     received, now_ns = Received(), time.time_ns()
     assert received.send(topic, string_cdr(text)) is None and "no stamp" in received.lines[0]
     assert received.send(topic, string_cdr(f"{text} stamp=0")) is None
@@ -466,7 +466,7 @@ def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(topic: st
         ("route", string_cdr("teach ../../etc/passwd")),
     ],
 )
-def test_what_is_no_request_is_refused(topic: str, payload: bytes) -> None:
+def test_malformed_requests_are_refused(topic: str, payload: bytes) -> None:
     received = Received()
     assert received.send(topic, payload) is None
     assert received.answer is not None and not received.answer.done and received.answer.text in received.lines[0]

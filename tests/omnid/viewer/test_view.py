@@ -96,7 +96,7 @@ def test_the_path_is_that_of_the_tum_file(drawn: Path) -> None:
     np.testing.assert_allclose([piece[0] for piece in pieces[1:]], [piece[1] for piece in pieces[:-1]], atol=0)
 
 
-def test_shows_a_recording(drawn: Path, omnid: Command) -> None:
+def test_the_viewer_shows_a_recording(drawn: Path, omnid: Command) -> None:
     code, out, _ = omnid("view", drawn / "rec.mcap", "-o", drawn / "rec.rrd")
     assert code == 0 and out.startswith(f"{PAIRS} poses and 0 images shown\n")
     for ours, recorded in zip(positions(drawn / "out.rrd"), positions(drawn / "rec.rrd"), strict=True):
@@ -130,22 +130,22 @@ def publish(bus: Bus, number: int) -> None:
     )
 
 
-def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
+def test_the_viewer_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
     need_rerun()
     endpoint, drawn = free_endpoint(), tmp_path / "live.rrd"
     publishing = contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,))))
     words = ("view", "--robot", "rover", "--connect", endpoint, "-o", drawn, "--seconds", 2)
     home = {"DISPLAY": "", "WAYLAND_DISPLAY": "", "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path / "config")}
-    with publishing as bus, running([*OMNID, *words], home) as it:
+    with publishing as bus, running([*OMNID, *words], home) as viewer:
         deadline_s = time.monotonic() + DEADLINE_S
         for number in count():
             publish(bus, number)
             time.sleep(0.01)
-            if it.poll() is not None:
+            if viewer.poll() is not None:
                 break
             assert time.monotonic() < deadline_s
-        out, err = it.communicate()
-    assert it.returncode == 0 and err == "" and "poses and" in out
+        out, err = viewer.communicate()
+    assert viewer.returncode == 0 and err == "" and "poses and" in out
     stamps_ns, xyz = positions(drawn)
     numbers = (stamps_ns - START_NS) // 10**7
     assert len(numbers) > 20 and (np.diff(numbers) > 0).all() and not (numbers % 7 == 0).any()

@@ -241,7 +241,7 @@ def test_arming_that_was_asked_for_before_a_stop_and_comes_after_it_is_refused(
         *(("/drive", text, "the stick sends") for text in ("1 0 1 A", "1 0 1", "1 0 -1 a", " 1 0 1 a", "nan 0 1 a")),
     ],
 )
-def test_what_lets_the_robot_move_and_comes_late_or_without_a_stamp_is_refused(
+def test_requests_that_move_the_robot_are_refused_late_or_without_a_stamp(
     rover: Rover, page: RobotPage, path: str, text: str, words: str
 ) -> None:
     answer = post(page, path, text)

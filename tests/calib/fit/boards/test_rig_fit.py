@@ -62,7 +62,7 @@ def off(found: RigCalibration) -> tuple[float, float]:
     return float(np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3])))), float(1e3 * np.linalg.norm(gap[:3, 3]))
 
 
-def test_recovers_the_rig() -> None:
+def test_the_fit_recovers_the_rig() -> None:
     found = calibrated(pairs(ODD))
     assert off(found)[0] < 0.01 and off(found)[1] < 0.15 and found.pairs == 10 and found.rejected == ()
     assert found.cameras[0].center == pytest.approx(LOWER.center, abs=0.01)
@@ -85,7 +85,7 @@ def one_sided(camera: OmniCamera, noise_px: float = 0.0, seed: int = 0) -> list[
 
 
 @pytest.mark.parametrize("truth", [OCAM, DIRECT, PINHOLE])
-def test_recovers_one_camera_of_any_kind(truth: OmniCamera) -> None:
+def test_the_fit_recovers_one_camera_of_any_kind(truth: OmniCamera) -> None:
     view = "direct" if truth in (DIRECT, PINHOLE) else "mirror"
     found = calibrate_boards(one_sided(truth), ODD, [SIZE], "direct" if view == "direct" else "mirror").cameras[0]
     angles, radii = np.meshgrid(np.arange(0, 6.2, 0.5), np.linspace(80, 340, 9))
@@ -136,7 +136,7 @@ def test_views_that_do_not_fit_are_rejected_by_name() -> None:
     assert any(view.seen[0] is None for view in found.views)
 
 
-def test_refuses_too_few_views_and_pairs() -> None:
+def test_too_few_views_and_pairs_are_refused() -> None:
     with pytest.raises(CalibError, match="expected at least 4 views of the board, found 3; hold the board"):
         calibrated(pairs(ODD)[:3])
     exchanged = [
@@ -198,7 +198,7 @@ def test_a_real_mirror_is_fitted_to_a_quarter_of_a_pixel(shared_data: Path) -> N
     ("key", "mean_px", "apart_deg"),
     [pytest.param("ocam_std", 0.4705, 0.35, marks=pytest.mark.slow), ("ocam_subpix", 0.305, 0.2)],
 )
-def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(
+def test_the_fit_has_less_error_at_the_toolbox_corners_than_the_toolbox(
     shared_data: Path, key: str, mean_px: float, apart_deg: float
 ) -> None:
     numbers, views, errors = reference(shared_data, key)

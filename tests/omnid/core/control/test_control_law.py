@@ -191,7 +191,7 @@ def turn(setpoint: Setpoint, heading_rad: float, seconds: float) -> list[float]:
 
 @pytest.mark.parametrize("start_rad", [0.0, 1.0, -3.0, 3.1, math.pi])
 @pytest.mark.parametrize("goal_rad", [0.0, 0.5, -1.5, 3.0, -3.0, math.pi, 7.0])
-def test_reaches_the_heading_the_short_way_without_overshoot(start_rad: float, goal_rad: float) -> None:
+def test_the_law_reaches_the_heading_the_short_way_without_overshoot(start_rad: float, goal_rad: float) -> None:
     headings = turn(Setpoint(0.3, goal_rad), start_rad, 12.0)
     way_rad = wrap_angle(goal_rad - start_rad)
     turned = [abs(heading - start_rad) for heading in headings]
@@ -199,7 +199,7 @@ def test_reaches_the_heading_the_short_way_without_overshoot(start_rad: float, g
     assert max(turned) <= abs(way_rad) + 0.005
 
 
-def test_turns_on_although_noise_at_half_a_turn_changes_the_nearer_side() -> None:
+def test_a_turn_goes_on_although_noise_at_half_a_turn_changes_the_nearer_side() -> None:
     heading_rad, motion = 0.0, Twist()
     for i in range(12):
         measured = wrap_angle(heading_rad + (0.1 if i % 2 else -0.1))  # the nearer side changes with every step
@@ -210,7 +210,7 @@ def test_turns_on_although_noise_at_half_a_turn_changes_the_nearer_side() -> Non
 
 @pytest.mark.parametrize("value", NOT_FINITE)
 @pytest.mark.parametrize("place", ["velocity", "goal", "yaw rate", "heading"])
-def test_slows_to_a_stop_where_an_input_is_not_finite(value: float, place: str) -> None:
+def test_the_base_slows_to_a_stop_where_an_input_is_not_finite(value: float, place: str) -> None:
     setpoint = Setpoint(
         value if place == "velocity" else 0.5, value if place == "goal" else 1.0, value if place == "yaw rate" else 0.0
     )

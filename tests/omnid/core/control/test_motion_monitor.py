@@ -125,7 +125,7 @@ HONEST: dict[str, tuple[Wish, World]] = {
 
 
 @pytest.mark.parametrize(("wish", "world"), HONEST.values(), ids=HONEST)
-def test_what_robots_do_is_no_contradiction(wish: Wish, world: World) -> None:
+def test_motions_of_usual_robots_are_no_contradiction(wish: Wish, world: World) -> None:
     _, history = run(wish, 60.0, world)
     assert [entry for entry in history if entry[1] or entry[2]] == []
 

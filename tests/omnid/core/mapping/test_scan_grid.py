@@ -75,7 +75,7 @@ def test_an_obstacle_that_has_gone_is_cleared_and_a_new_one_appears() -> None:
     assert near(grid, 1.0, 1.0) == {FREE} and OCCUPIED in near(grid, 1.0, -0.7)
 
 
-def test_what_no_scan_shows_is_free_nowhere_as_its_floor_is_not_seen() -> None:
+def test_floor_that_no_scan_shows_is_not_free() -> None:
     """All scans pass over a low box; views pass through the space above it."""
     path = np.array([pose(x, 0, 0) for x in np.arange(-2.5, 7.0, 0.3)])
     walls, low = box((-3.5, -2.0), (8.0, 2.0)), box((0.0, 1.0), (0.4, 1.4))
@@ -209,7 +209,7 @@ def row(start: int, count: int) -> Array:
     return np.stack([np.arange(start, start + count) + 0.5, np.zeros(count), np.zeros(count)], axis=1)
 
 
-def test_agrees_with_a_dictionary() -> None:
+def test_the_scan_grid_agrees_with_a_dictionary() -> None:
     rng = np.random.default_rng(5)
     voxels = VoxelMap(voxel_m=0.1, max_voxels=4096)
     sums: dict[tuple[int, ...], Array] = {}
@@ -229,7 +229,7 @@ def test_agrees_with_a_dictionary() -> None:
     assert found.age.tolist() == [19 - seen[k][-1] for k in keys]
 
 
-def test_evicts_the_least_confident_voxels_and_the_oldest_of_these() -> None:
+def test_the_least_confident_voxels_are_evicted_and_the_oldest_of_these() -> None:
     voxels = VoxelMap(voxel_m=1.0, max_voxels=44)
     voxels.insert(row(0, 15), var(15, 1e-2), seq=0)  # seen once and long ago
     for seq in (100, 101):

@@ -149,7 +149,7 @@ def test_a_base_that_begins_too_near_drives_away() -> None:
     assert base.run(60).state is NavigationState.REACHED
 
 
-def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
+def test_the_plan_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
     base = BaseAmongBoxes(Navigator(SETTINGS), 6)
     base.boxes = Boxes((2.8, 1.2, 3.2, 1.6))
     path = drive_path([(0.0, 0.0), (3.0, 0.0), (3.0, 3.0)], math.pi / 2)

@@ -191,7 +191,7 @@ def test_in_a_saved_map_the_covariance_is_that_of_the_place_and_not_of_odom(
     assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY, MapState.LOCALIZED}
 
 
-def test_what_is_saved_is_joined_with_the_oldest_place(
+def test_a_saved_map_is_joined_with_the_oldest_place(
     cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
 ) -> None:
     """A run that never recognised anything is left out, and counted."""

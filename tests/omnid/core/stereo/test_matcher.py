@@ -73,7 +73,7 @@ def test_disparities_are_subpixel(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_leaves_out_pixels_without_a_match(method: str) -> None:
+def test_pixels_without_a_match_are_left_out(method: str) -> None:
     blank, other = np.full(SHAPE, 90, np.uint8), texture(9, SHAPE)
     assert len(matched(method, blank, other, middle())[0]) == 0
     lower, valid = texture(10, SHAPE), middle()
