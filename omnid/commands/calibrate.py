@@ -51,6 +51,7 @@ board:
 --tag-mm MM          aprilgrid: side of one tag (tagSize)
 --tag-spacing RATIO  aprilgrid: space between tags as a fraction of a tag's side, like 0.3 (tagSpacing)
 """
+REPLACE: Final = "--replace  write the rig in the place of an existing file, whose height and masks are lost"
 
 
 def board_of(args: argparse.Namespace) -> AnyBoard:
@@ -66,7 +67,13 @@ def board_of(args: argparse.Namespace) -> AnyBoard:
     return Board(columns, rows, args.square_mm / 1e3)
 
 
-@options.command(BOARD, options.LOG_CAMERAS, options.HEIGHT, options.QUIET)
+def require_new(args: argparse.Namespace) -> None:
+    """Raise OmnidError where the rig would be written over another one, unless that is asked for."""
+    if args.output.exists() and not args.replace:
+        raise OmnidError(f"--output {args.output} exists: --replace writes the rig in its place")
+
+
+@options.command(BOARD, options.LOG_CAMERAS, options.HEIGHT, REPLACE, options.QUIET)
 def of_board(args: argparse.Namespace) -> int:
     """Make a rig.toml from images of a board that both cameras saw at once.
 
@@ -87,6 +94,7 @@ def of_board(args: argparse.Namespace) -> int:
     board = board_of(args)
     reports = [("--report", args.report)] if args.report else []
     check_outputs([("--output", args.output), *reports], [("a file that is read", args.images)])
+    require_new(args)
     expected_mm = args.expected_baseline_mm
     found = calibrate_rig(
         args.images,
@@ -236,7 +244,7 @@ def _measured(args: argparse.Namespace, rig: Rig, measure: Callable[[Path, Rig, 
     return found
 
 
-@options.command(options.HEIGHT)
+@options.command(options.HEIGHT, REPLACE)
 def import_rig(args: argparse.Namespace) -> int:
     """Make a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras.
 
@@ -249,7 +257,6 @@ def import_rig(args: argparse.Namespace) -> int:
     --frame imu|cameras=imu     the rig frame of a file with T_cam_imu: that of the IMU, whose z must point up; cameras:
         the origin at the lower viewpoint, z to the upper one, x ahead
     -o, --output FILE           the rig.toml to write (required)
-    --replace                   write it in the place of an existing file
     --baseline M 0.001..5       metres from the lower viewpoint straight up to the upper one; both cameras look up and
         are equally oriented
 
@@ -259,11 +266,10 @@ def import_rig(args: argparse.Namespace) -> int:
     """
     read = [path for path in (args.camchain, args.lower, args.upper) if path]
     check_outputs([("--output", args.output)], [("a file that is read", Path(path)) for path in read])
+    require_new(args)
     rig = _imported(args)
     if args.height_m is not None:
         rig = rig.at_height(args.height_m)
-    if args.output.exists() and not args.replace:
-        raise OmnidError(f"--output {args.output} exists: --replace writes the rig in its place")
     write_rig(args.output, rig)
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(T_upper_lower))))

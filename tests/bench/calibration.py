@@ -87,7 +87,7 @@ def render_drive(name: str, seed: int, amount: float, folder: Path) -> None:
 def calibrate(folder: Path, output: Path) -> Rig:
     """Return the rig that `omnid calibrate rig` makes of the images of a folder, and print its line."""
     board = ["--corners", f"{BOARD.columns}x{BOARD.rows}", "--square-mm", f"{1e3 * BOARD.square_m:g}"]
-    words = ["calibrate", "rig", str(folder), *board, "--view", "mirror", "--quiet", "-o", str(output)]
+    words = ["calibrate", "rig", str(folder), *board, "--view", "mirror", "--quiet", "--replace", "-o", str(output)]
     with contextlib.redirect_stdout(sys.stderr):
         code = omnid_main(words)
     if code != 0:

@@ -172,5 +172,5 @@ byId("wider").addEventListener("click", () => plan.zoom(1 / 1.5));
 byId("fit").addEventListener("click", () => plan.fit());
 plan.onFit = (fits) => byId("fit").setAttribute("aria-pressed", String(fits));
 wireMap();
-byId("panorama-note").textContent = "None comes yet: the robot publishes it unless bus.panorama_hz = 0.";
+byId("panorama-note").textContent = "No panorama yet; bus.panorama_hz = 0 turns it off.";
 follow();

@@ -134,6 +134,8 @@ def test_images_without_a_board_are_one_line_and_exit_code_2(
     (line,) = capsys.readouterr().err.splitlines()
     assert "no board of 7x6 inner corners in any of 3 images of the upper camera" in line
     assert not (tmp_path / "rig.toml").exists()
+    (tmp_path / "rig.toml").touch()
+    assert run("-o", tmp_path / "rig.toml", tmp_path) == 2 and "exists: --replace" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
