@@ -31,14 +31,14 @@ import numpy as np
 
 import omnid
 from calib.models.lens import full_turn
-from calib.rig import RigCovariance, ShutterTimes
+from calib.rig import ShutterTimes
 from calib.rig_file import read_rig
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.ray_caster import Sensor
 from omnid.tracking_state import TrackingState
-from tests.bench.accuracy import position_errors, squared_errors
+from tests.bench.accuracy import EXACT, position_errors, squared_errors
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation import SimulatedRun, build, corridor, paths, write_log
 from tests.simulation.builders import repeating, room
@@ -50,7 +50,6 @@ from tests.simulation.rigs import lens, lens_rig
 SIZE: Final = 384
 STEP_M: Final = 0.05
 LINE_US: Final = 52.0  # of a rolling shutter
-EXACT: Final = RigCovariance(("baseline",), np.zeros(1), np.eye(1))  # nothing is added for the rig, which is right
 COLUMNS: Final = columns(
     "drive",
     *("length|mm|1", "length|%|2", "ATE rmse|mm|1", "error at the end|mm|1", "largest error|mm|1"),

@@ -56,7 +56,7 @@ SAME_M = 0.02  # Poses that differ less are one, because four sigmas of a pose t
 class PoseEstimate:
     """Pose of a frame in odom with its covariance, and the number of landmarks predicted, tracked and inliers.
 
-    The covariance takes the landmarks of the local map as exact; that of a pose found by the relocaliser is complete.
+    The covariance takes the keyframes of the local map as exact.
     """
 
     T_odom_rect: Array
@@ -68,6 +68,8 @@ class PoseEstimate:
     views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) px of them at the stamp, NaN: not in upper
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px of them in the lower panorama
     variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view
+    # (M, 6, 6) derivatives of the pose by a motion of each of them, both [t; r] in the rectified frame
+    by_landmark: Array = field(default_factory=lambda: np.zeros((0, 6, 6)))
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
     # (M, K) px by m/s and rad/s: derivatives of the disparities by the velocity, and the one that was assumed.
     by_motion: Array = field(default_factory=lambda: np.zeros((0, 0)))

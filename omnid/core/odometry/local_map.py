@@ -30,7 +30,7 @@ from omnid.core.odometry.plane_patches import (
     plane_maps,
     plane_templates,
 )
-from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED
+from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED, POSE
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from omnid.core.types.panorama import PaddedPanorama
@@ -63,12 +63,15 @@ LANDMARK = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """Panorama in which landmarks are anchored; T_odom_rect is the pose of its rectified frame, covariance its own."""
+    """Panorama in which landmarks are anchored; T_odom_rect is the pose of its rectified frame.
+
+    Each was found by those before it, so that they share errors: they are sums of K independent draws of one sigma.
+    """
 
     seq: int
     lower: PaddedPanorama
     T_odom_rect: Array
-    covariance: Array  # (6, 6) [t; r] in the rectified frame
+    error: Array  # (6, K) [t; r] of the pose in the rectified frame, by the draws
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +140,12 @@ class LocalMap:
             others, half = counts.keys() - {keyframe.seq}, len(self._rows) / 2
             self.keyframes.pop(min(others, key=lambda seq: (counts[seq] > half, seq)))
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
+        # The newest one has a draw more. No more are needed than the errors have numbers: a root of their covariance.
+        count = keyframe.error.shape[1]
+        errors = [np.pad(each.error, ((0, 0), (0, count - each.error.shape[1]))) for each in self.keyframes.values()]
+        root = np.asarray(np.linalg.qr(np.reshape(errors, (-1, count)).T, mode="r")).T
+        for n, (seq, each) in enumerate(self.keyframes.items()):
+            self.keyframes[seq] = replace(each, error=root[POSE * n : POSE * (n + 1)])
         return finite
 
     def settle(self, velocity: RigVelocity | None) -> None:
@@ -299,14 +308,9 @@ class LocalMap:
         table, T_curr_ref = self.table, self.from_anchors(se3.inverse(T_odom_rect), landmarks)
         return moved_slopes((table.anchor_points[landmarks], table.slopes[landmarks]), T_curr_ref, self._model)
 
-    def covariance_of(self, estimate: PoseEstimate) -> Array:
-        """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to a pose."""
-        anchors, counts = np.unique(self.table.anchor[estimate.landmarks], return_counts=True)
-        if not len(anchors):
-            return np.zeros((6, 6))
-        keyframes = [self.keyframes[seq] for seq in anchors.tolist()]
-        poses = np.array([keyframe.T_odom_rect for keyframe in keyframes])
-        covariance = np.array([keyframe.covariance for keyframe in keyframes])
-        A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ poses)
-        weighted = (counts / counts.sum())[:, None, None] * A
-        return np.asarray((weighted @ covariance @ np.swapaxes(A, 1, 2)).sum(axis=0))
+    def error_of(self, estimate: PoseEstimate) -> Array:
+        """Return the error (6, K) that the keyframes pass on to a pose: each moves its landmarks, and they the pose."""
+        keyframes, anchors = list(self.keyframes.values()), self.table.anchor[estimate.landmarks]
+        by_keyframe = np.array([estimate.by_landmark[anchors == each.seq].sum(axis=0) for each in keyframes])
+        A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ np.array([each.T_odom_rect for each in keyframes]))
+        return np.asarray((by_keyframe @ A @ np.array([each.error for each in keyframes])).sum(axis=0))

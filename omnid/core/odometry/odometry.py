@@ -106,6 +106,7 @@ class VisualOdometry:
         self._motion, self._other = motion or MotionFilter(), OtherMotion()
         self._static_mask = StaticMask(model.cylinder)
         self._T_odom_rect = np.eye(4)
+        self._error = np.zeros((6, 0))  # [t; r] of it, by the draws of the keyframes and one of its own
         self._state, self._resets = TrackingState.LOST, 0  # resets: odom lost its relation to what was published
         self._T_at_fix: Array | None = None  # the last accepted pose; None: there was no map yet
         self._since_fix_s = 0.0
@@ -209,8 +210,7 @@ class VisualOdometry:
         is_keyframe = inliers < max(limits.good_inliers, limits.refresh * self._most_inliers)
         is_keyframe |= inliers < limits.refresh * limits.features and self._tracked_s >= limits.sparse_s
         if is_keyframe:
-            covariance = self._motion.pose_covariance
-            self._add_keyframe = partial(self._make_keyframe, now, self._T_odom_rect, covariance, exposure, estimate)
+            self._add_keyframe = partial(self._make_keyframe, now, exposure, estimate)
         features = Features(estimate.pixels, estimate.rejected)
         result = self._result(estimate.tracked, estimate.inliers, exposure, features)
         return replace(result, is_keyframe=is_keyframe)
@@ -241,7 +241,7 @@ class VisualOdometry:
         velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found.T_odom_rect, now.dt_s)
         then, at = (Exposure(each.frame.times, velocity, self._model) for each in (first, now))
         self._map.clear()
-        self._make_keyframe(first, self._T_odom_rect, self._motion.pose_covariance, then)
+        self._make_keyframe(first, then)
         again = self._search.estimate(now.frame, found.T_odom_rect, at, is_near=True)
         return [] if again is None else [again]
 
@@ -283,14 +283,14 @@ class VisualOdometry:
         elif not now.is_measured:
             self._motion.reset()
         self._map.settle(at_previous)
-        self._motion.found(estimate.covariance + self._map.covariance_of(estimate))
+        self._error = np.hstack([self._map.error_of(estimate), _root(estimate.covariance)])
+        self._motion.found(self._error @ self._error.T)
         # 3. The pose and its state.
         self._T_odom_rect = estimate.T_odom_rect
         # What the upper camera does not show where it must be is an outlier there.
         self._cost = estimate.cost + OUTLIER_COST * (1.0 - estimate.upper_ratio), estimate.in_view
-        if len(estimate.landmarks):
-            away = self._map.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
-            self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
+        away = self._map.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
+        self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
         is_doubtful = not is_sure or estimate.upper_ratio < limits.good_inlier_ratio or is_after_gap
         self._fix(is_doubtful=is_doubtful, is_reset=is_reset)
         self._static_mask.observe(now.frame.lower.panorama, self._T_odom_rect)
@@ -354,7 +354,8 @@ class VisualOdometry:
     def _start_map(self, now: _Prediction, *, carried: bool, is_elsewhere: bool = False) -> OdometryEstimate:
         """Start a map at the current pose if the frame has enough landmarks."""
         exposure = self._exposure(now.frame)
-        self._make_keyframe(now, self._T_odom_rect, self._motion.pose_covariance, exposure)
+        self._error = _root(self._motion.pose_covariance)
+        self._make_keyframe(now, exposure)
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._refused_s = self._unmatched_s = None
@@ -367,15 +368,8 @@ class VisualOdometry:
         self._fix(is_doubtful=is_unknown and not is_elsewhere, is_reset=is_unknown)
         return replace(self._result(len(self._map), len(self._map), exposure), is_keyframe=True)
 
-    def _make_keyframe(
-        self,
-        now: _Prediction,
-        T_odom_rect: Array,
-        covariance: Array,
-        exposure: Exposure,
-        seen: PoseEstimate | None = None,
-    ) -> None:
-        """Add a frame to the map, with its pose (4, 4) and covariance (6, 6), and with new landmarks.
+    def _make_keyframe(self, now: _Prediction, exposure: Exposure, seen: PoseEstimate | None = None) -> None:
+        """Add the frame of the present pose to the map, with new landmarks.
 
         seen: the estimate whose landmarks stay; None: all are new.
         """
@@ -383,7 +377,7 @@ class VisualOdometry:
         points = corners(now.frame.lower, clear_around(now.frame.usable, pixels), self._limits.features - len(pixels))
         frame = replace(now.frame, exposure=exposure)
         new = located(frame, points, self._model, self._upper_klt, exposure, views)
-        keyframe = Keyframe(frame.seq, frame.lower, T_odom_rect, covariance)
+        keyframe = Keyframe(frame.seq, frame.lower, self._T_odom_rect, self._error)
         self._map.add_keyframe(keyframe, new)
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(frame, keyframe)
@@ -412,6 +406,12 @@ class VisualOdometry:
 def _step(T_a: Array, T_b: Array) -> Array:
     """Return the step (6,) [t; r] from one pose to another, in the axes of the first one."""
     return se3.log(se3.inverse(T_a) @ T_b)
+
+
+def _root(covariance: Array) -> Array:
+    """Return R (6, 6) with R R^T = covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _keeps_view(T_a: Array, T_b: Array) -> bool:

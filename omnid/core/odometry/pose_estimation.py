@@ -96,11 +96,12 @@ def consensus(a: Array, b: Array, agree: Callable[[Array], Flags], rng: np.rando
 
 @dataclass(frozen=True, slots=True)
 class GaussNewtonResult:
-    """Motion T_curr_ref with its covariance (6, 6) [t; r] in curr, and the squared error of each view."""
+    """Motion T_curr_ref with its covariance (6, 6) [t; r] in curr, and what each view adds to it."""
 
     T: Array
-    covariance: Array
-    squared: Array  # (N,) squared Mahalanobis distance
+    covariance: Array  # of independent views whose noise is as large as their errors say
+    squared: Array  # (N,) squared Mahalanobis distance of each view
+    by_landmark: Array  # (N, 6, 6) derivatives of the motion by one of each landmark, both [t; r] in curr
 
 
 def gauss_newton(
@@ -153,11 +154,18 @@ def gauss_newton(
         weighted = J * weight[:, None, None]
         H = prior + np.tensordot(weighted, information @ J, axes=((0, 1), (0, 1)))
         g = np.tensordot(weighted, informed, axes=((0, 1), (0, 1))) - prior[:, POSE:] @ error
-        inverse = np.linalg.inv(H)
         if number == GAUSS_NEWTON_STEPS:
             break
-        step = inverse @ g
+        step = np.linalg.inv(H) @ g
         T, error = se3.exp(step[:POSE]) @ T, error + step[POSE:]
         if np.abs(step[:POSE]).max() < CONVERGED:
             break
-    return GaussNewtonResult(T, inverse[:POSE, :POSE], squared)
+    # 3. The covariance, by the noise that the errors show: N numbers have squares of N - 6 in the mean. Six are added,
+    #    so that views without an error do not make the pose exact. Views that share an error of the velocity agree
+    #    better with each other than with the truth: only more noise counts then.
+    numbers = int((VIEW - is_lower_only[is_right]).sum())
+    share = max((float(squared[is_right].sum()) + POSE) / max(numbers, POSE), 1.0 if len(of_error) else 0.0)
+    inverse = np.asarray(np.linalg.inv(H + (share - 1) * prior), float)
+    # 4. A motion of a landmark changes its error by J, and the solution by H^-1 J^T S^-1 J.
+    by_motion = np.linalg.inv(H)[:POSE] @ np.swapaxes(weighted, 1, 2) @ information @ J[:, :, :POSE]
+    return GaussNewtonResult(T, share * inverse[:POSE, :POSE], squared, by_motion)

@@ -175,19 +175,15 @@ class PoseSearch:
         solution, kept = self._solve(landmarks, views, T_curr_odom, self._model, noise, shared)
         if solution is None:
             return None
-        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it. A squared distance is
-        #    a sum of as many squares as a view has numbers, each with an expected value of 1.
-        scale = CORRELATED * max(1.0, float(solution.squared[kept].mean()) / views.shape[1])
-        # 5. The mean cost of a landmark in view; an outlier costs what the last inlier does.
-        inliers = solution.squared[solution.squared < OUTLIER_SQUARED]
-        costs = float(cost(inliers).sum()) + (in_view - len(inliers)) * OUTLIER_COST
-        # 6. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
+        # 4. The mean cost of a landmark in view; an outlier costs what the last inlier does.
+        costs = float(cost(solution.squared[kept]).sum()) + (in_view - int(kept.sum())) * OUTLIER_COST
+        # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
         #    with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
         #    and the scale would drift.
         landmarks = landmarks[kept]
         return PoseEstimate(
             se3.inverse(solution.T),
-            scale * solution.covariance,
+            CORRELATED * solution.covariance,
             in_view,
             int(found.sum()),
             len(landmarks),
@@ -195,6 +191,7 @@ class PoseSearch:
             views[kept],
             pixels[kept],
             variance[landmarks],
+            solution.by_landmark[kept],
             by_motion=(by_motion[:, 2] - by_motion[:, 1])[kept],
             assumed=exposure.motion,
             cost=costs / max(1, in_view),

@@ -35,13 +35,9 @@ class StereoFrame:
         return self.disparities(self.exposure) if callable(self.disparities) else self.disparities
 
 
-def _no_pixels() -> NDArray[np.float64]:
-    return np.zeros((0, 2))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
     """Pixels (N, 2) = (column, row) in the lower panorama of the features of a frame, for display."""
 
-    inliers: NDArray[np.float64] = field(default_factory=_no_pixels)  # landmarks that support the pose
-    rejected: NDArray[np.float64] = field(default_factory=_no_pixels)  # tracked landmarks, no inliers
+    inliers: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))  # landmarks that support the pose
+    rejected: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))  # tracked landmarks, no inliers

@@ -217,8 +217,7 @@ def recognise(
     if count < MIN_MATCHES:
         return None
     azimuth = np.floor(views[b2[kept], 0] * (SECTORS / cylinder.width)).astype(int) % SECTORS
-    scale = CORRELATED * max(1.0, float(fit.squared[kept].mean()) / views.shape[1])
-    covariance = scale * fit.covariance + FLOOR
+    covariance = CORRELATED * fit.covariance + FLOOR
     return Recognition(id, se3.inverse(fit.T), covariance, count, len(a), len(np.unique(azimuth)))
 
 
@@ -305,18 +304,15 @@ class Relocaliser:
         self._features.clear()
 
     def locate(self, frame: StereoFrame) -> PoseEstimate | None:
-        """Return the pose with the most inliers, with the complete covariance; None where no keyframe is recognised."""
+        """Return the pose with the most inliers; None where no keyframe is recognised. The keyframe is exact."""
         # 1. Describe the frame, and the keyframes that no search has described before.
         features = describe(frame)
         self._features = {kept.seq: self._features.get(kept.seq) or describe(kept) for kept, _ in self._kept}
         # 2. Search it among them, as in the map of places.
-        keyframes = {keyframe.seq: keyframe for _, keyframe in self._kept}
-        poses = {seq: keyframe.T_odom_rect for seq, keyframe in keyframes.items()}
-        effort = NEAR._replace(compared=len(keyframes))
+        poses = {keyframe.seq: keyframe.T_odom_rect for _, keyframe in self._kept}
+        effort = NEAR._replace(compared=len(poses))
         best = search(features, self._features, poses, effort, self._model)
         if best is None:
             return None
-        A = se3.adjoint(se3.inverse(best.T_place_rect))
-        covariance = best.covariance + A @ keyframes[best.id].covariance @ A.T
         matches = max(best.matches, best.inliers)
-        return PoseEstimate(poses[best.id] @ best.T_place_rect, covariance, matches, matches, best.inliers)
+        return PoseEstimate(poses[best.id] @ best.T_place_rect, best.covariance, matches, matches, best.inliers)

@@ -121,7 +121,7 @@ T_ODOM_KEYFRAME = se3.exp([3.0, 1.0, 0, 0, 0, 2.0])
 
 
 def _add(relocaliser: Relocaliser, frame: StereoFrame, T_odom_rect: NDArray[np.float64]) -> None:
-    relocaliser.add(frame, Keyframe(frame.seq, frame.lower, T_odom_rect, np.diag([1e-6] * 6)))
+    relocaliser.add(frame, Keyframe(frame.seq, frame.lower, T_odom_rect, np.diag([1e-3] * 6)))
 
 
 def test_the_pose_beside_a_keyframe_is_found_and_no_other_place_is_taken_for_it(
