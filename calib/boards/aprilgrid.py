@@ -77,15 +77,16 @@ def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: f
     places (M, 2) [squares] and outlines (M, 2) [px]: the tags' corners.
     """
     pixels = np.full(points.shape, np.nan)
-    at, where = places, outlines
+    known_points, known_pixels = places, outlines
     while True:
         tried = np.flatnonzero(np.isnan(pixels[:, 0])).tolist()
-        found = shown_corners(image, {k: local_mapping(points[k], at, where) for k in tried}, window)
+        found = shown_corners(image, {k: local_mapping(points[k], known_points, known_pixels) for k in tried}, window)
         if not found:
             break
         pixels[list(found)] = np.array(list(found.values()))
         new = np.isfinite(pixels[:, 0])
         # Corners are more accurate than the outlines of tags, which remain where there are no corners yet.
         far = np.linalg.norm(places[:, None] - points[new], axis=2).min(axis=1) > REACH
-        at, where = np.vstack([points[new], places[far]]), np.vstack([pixels[new], outlines[far]])
+        known_points = np.vstack([points[new], places[far]])
+        known_pixels = np.vstack([pixels[new], outlines[far]])
     return pixels

@@ -100,8 +100,8 @@ def test_a_wrong_word_is_named_with_what_was_expected(
 
 def test_a_signal_while_modules_are_loaded_ends_the_program_quietly() -> None:
     script = (
-        "import signal\nfrom omnid import cli\ncli.import_module = lambda _: signal.raise_signal(signal.SIGINT)\n"
-        "cli.main(['replay', 'log.mcap'])"
+        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\nfrom omnid import cli\n"
+        "cli.import_module = lambda _: signal.raise_signal(signal.SIGINT)\ncli.main(['replay', 'log.mcap'])"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

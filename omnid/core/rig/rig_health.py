@@ -159,12 +159,12 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
         good[index] = best >= MIN_CORRELATION
         clear += bool(patch.std() > TEXTURE_GREY)  # noise alone, averaged over COARSE^2 pixels, has less
     # 2. Track from there, to parts of a pixel.
-    there, is_tracked = track(lower, upper, points, guess, KLT)
+    tracked, is_tracked = track(lower, upper, points, guess, KLT)
     # 3. Keep those that stay near the coarse place and lie lower in the upper panorama than in the lower one.
-    step = there - guess
+    step = tracked - guess
     step[:, 0] = lower.wrap(step[:, 0])
-    good &= is_tracked & (np.abs(step).max(axis=1) < 2 * COARSE) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
-    below, above = points[good], there[good]
+    good &= is_tracked & (np.abs(step).max(axis=1) < 2 * COARSE) & (tracked[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
+    below, above = points[good], tracked[good]
     if exposure is not None:
         # 4. Views at the stamp of the pair, where its images were exposed at several times.
         views, of_motion = exposure.corrected(below, above[:, 1])
