@@ -31,13 +31,13 @@ class Result:
     """Result of the tests of a script in the guest."""
 
     output: str  # stdout and stderr
-    files: Mapping[str, bytes]  # content of /mnt/job/results
+    report: bytes  # JUnit's XML
 
     def require_passed(self, name: str) -> None:
         """Raise AssertionError, with the output of the test, unless it ran and passed with all parameters."""
         cases = [
             case
-            for case in ElementTree.fromstring(self.files["report.xml"]).iter("testcase")
+            for case in ElementTree.fromstring(self.report).iter("testcase")
             if str(case.get("name")).partition("[")[0] == name
         ]
         assert cases, f"it was not run:\n{self.output[-4000:]}"
@@ -66,8 +66,7 @@ def run_tests(
     panicked or took too long; ImageUnavailableError without QEMU or an image.
     """
     words = ["python3", "-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "--durations=10"]
-    words += ["--junitxml=/mnt/job/results/report.xml", "-o", "junit_logging=system-out"]
-    words += [f"tests/hardware/guest/{script}"]
+    words += ["--junitxml=/mnt/job/report.xml", "-o", "junit_logging=system-out", f"tests/hardware/guest/{script}"]
     with tempfile.TemporaryDirectory(prefix="omnid-guest-") as name:
         # 1. The job: the project, the command, the caller's files.
         job, ignored = Path(name), shutil.ignore_patterns("__pycache__", ".*")
@@ -77,7 +76,6 @@ def run_tests(
             copy(ROOT / part, job / "tree" / part, **({"ignore": ignored} if copy is shutil.copytree else {}))
         shutil.copy(HERE / "guest" / "job.sh", job / "start")
         (job / "command").write_text(f"exec {shlex.join(words)}\n", "utf-8")
-        (job / "results").mkdir()
         for part, data in (files or {}).items():
             (job / part).write_bytes(data)
         # 2. The machine.
@@ -98,7 +96,7 @@ def run_tests(
             panicked = "Kernel panic - not syncing" in console
             reason = "the guest's kernel panicked" if panicked else f"the guest did not end within {timeout_s:g} s"
             raise GuestError(f"{reason}\n{console[-4000:]}\n{output[-20000:]}")
-        return Result(output, {path.name: path.read_bytes() for path in (job / "results").iterdir() if path.is_file()})
+        return Result(output, (job / "report.xml").read_bytes())
 
 
 def _qemu(job: Path, systemd: bool, serial: Sequence[str]) -> list[str]:

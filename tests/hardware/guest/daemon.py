@@ -101,11 +101,6 @@ class Wheels:
         return float(self.state()["commanded_mps"])
 
 
-def journal_lines() -> list[str]:
-    """Return the lines of the unit in the journal."""
-    return [text for _, text in journal()]
-
-
 @pytest.fixture(scope="module", autouse=True)
 def unit() -> None:
     """omnid as the README installs it."""
@@ -179,13 +174,17 @@ def test_commands_turn_the_wheels_and_their_absence_stops_them(operator: GuestOp
     until(lambda: wheels.state()["commands"] > 3)
     before = wheels.state()
     assert before["fastest_mps"] == 0.0
-    operator.driving = True
-    until(lambda: wheels.commanded_mps > 0.25)
-    operator.driving = False
-    until(lambda: wheels.commanded_mps == 0.0)
+
+    def stops_for_want_of_commands() -> bool:
+        operator.driving = True
+        until(lambda: wheels.commanded_mps > 0.25)
+        operator.driving = False
+        until(lambda: wheels.commanded_mps == 0.0)
+        return "the wheels stop: the command is stale" in journal()
+
+    until(stops_for_want_of_commands)  # a slow machine may have no pose for as long
     after = wheels.state()
     assert after["errors"] == before["errors"] and after["way_m"] > 0.05
-    assert "the wheels stop: the command is stale" in journal_lines()
 
 
 def test_a_lost_camera_stops_the_wheels_until_it_is_back(
@@ -201,7 +200,7 @@ def test_a_lost_camera_stops_the_wheels_until_it_is_back(
     sample_log.open("lower")
     operator.more(3)
     until(lambda: wheels.commanded_mps > 0.25)
-    lost = [text for text in journal_lines() if "lower camera: " in text]
+    lost = [text for text in journal() if "lower camera: " in text]
     assert sum("lost, and tried again" in text for text in lost) == 1 and sum(": back, " in text for text in lost) == 1
     assert show("NRestarts") == "0"
 
@@ -225,7 +224,7 @@ def test_restarts_a_daemon_that_stalls(operator: GuestOperator, wheels: Wheels) 
     os.kill(pid, signal.SIGSTOP)
     until(lambda: wheels.commanded_mps == 0.0)
     restarted(pid)
-    lines = journal_lines()
+    lines = journal()
     assert any("Watchdog timeout" in text for text in lines)
     assert any("Fatal Python error: Aborted" in text for text in lines)
     operator.more(3)
@@ -241,4 +240,4 @@ def test_stopping_the_unit_stops_the_wheels(operator: GuestOperator, wheels: Whe
     after = wheels.state()
     assert after["commanded_mps"] == after["fastest_mps"] == 0.0
     assert (show("ActiveState"), show("Result"), show("ExecMainStatus")) == ("inactive", "success", "0")
-    assert after["unsafe_resumes"] == 0 and not any("Traceback" in text for text in journal_lines())
+    assert after["unsafe_resumes"] == 0 and not any("Traceback" in text for text in journal())

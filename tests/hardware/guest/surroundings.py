@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import json
 import os
 import subprocess
 import threading
@@ -50,10 +49,9 @@ def restarted(pid: int) -> None:
     until(lambda: int(show("MainPID")) not in (0, pid) and show("ActiveState") == "active")
 
 
-def journal() -> list[tuple[int, str]]:
-    """Return priority and text of all lines in the journal of the unit."""
-    lines = run("journalctl", "-u", "omnid", "--no-pager", "-o", "json").splitlines()
-    return [(int(entry["PRIORITY"]), entry["MESSAGE"]) for entry in map(json.loads, lines)]
+def journal() -> list[str]:
+    """Return the texts of all lines in the journal of the unit."""
+    return run("journalctl", "-u", "omnid", "--no-pager", "-o", "cat").splitlines()
 
 
 class Shown(NamedTuple):
