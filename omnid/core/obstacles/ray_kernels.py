@@ -55,7 +55,7 @@ class RayParameters(NamedTuple):
     cell_most: float = 4.0
     # Surfaces: where the mean over so many directions is largest, it counts so much more than one direction.
     wide_columns: float = 11.0
-    wide_weight: float = 5.0
+    wide_weight: float = 3.0
     # Look of the floor: learned up to this range [m], from so many bins at least.
     look_m: float = 1.8
     look_bins: float = 60.0
