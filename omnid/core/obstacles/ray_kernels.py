@@ -53,7 +53,8 @@ class RayParameters(NamedTuple):
     look_low: float = -2.5
     look_high: float = 1.0
     cell_most: float = 4.0
-    # Surfaces: where the mean over so many directions is largest, it counts so much more than one direction.
+    # Surfaces: the mean over so many directions counts as that of so many of them that have errors of their own, as a
+    # block of a JPEG is four wide. With 5 a joint of the floor, moved by the coding, was something that hangs.
     wide_columns: float = 11.0
     wide_weight: float = 3.0
     # Look of the floor: learned up to this range [m], from so many bins at least.
