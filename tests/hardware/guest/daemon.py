@@ -193,11 +193,13 @@ def test_a_lost_camera_stops_the_wheels_until_it_is_back(
     operator.driving = True
     until(lambda: wheels.commanded_mps > 0.25)
     sample_log.close("lower")
-    until(lambda: wheels.commanded_mps == 0.0)
-    until(lambda: operator.message("lower camera").startswith("camera /dev/omnid/lower"))
-    until(lambda: operator.message("pairing") == "no images of the lower camera")
-    assert wheels.state()["fastest_mps"] == 0.0
-    sample_log.open("lower")
+    try:
+        until(lambda: wheels.commanded_mps == 0.0)
+        until(lambda: operator.message("lower camera").startswith("camera /dev/omnid/lower"))
+        until(lambda: operator.message("pairing") == "no images of the lower camera")
+        until(lambda: wheels.state()["fastest_mps"] == 0.0)  # a slow machine may have had a pose in work
+    finally:
+        sample_log.open("lower")
     operator.more(3)
     until(lambda: wheels.commanded_mps > 0.25)
     lost = [text for text in journal() if "lower camera: " in text]

@@ -23,6 +23,7 @@ LIMIT_S = 400.0  # The clock of a guest on a busy host may run several times too
 SAMPLE = Path("/opt/omnid/omnid/sample")
 SIZE = 512, 512
 REPEAT_S = 0.5  # period of an image that is repeated
+MAX_REPEATS = 40  # of images without a pose: a slow daemon that paired one with that before leaves it out as repeated
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
 
 
@@ -62,13 +63,13 @@ class Shown(NamedTuple):
 
 
 class SampleLog:
-    """The sample log on both cameras, forwards and backwards, one step after each published pose."""
+    """The sample log on both cameras, forwards and backwards, one step after each published pose, or MAX_REPEATS."""
 
     def __init__(self) -> None:
         images = LogPlayback(SAMPLE / "log.mcap").frames
         self._data = [[bytes(timed[1].data) for timed in frames] for frames in images.values()]
         self._last = min(map(len, self._data)) - 1
-        self._step, self._moved = 0, threading.Event()
+        self._step, self._has_pose = 0, threading.Event()
         self._cameras: dict[Camera, Loopback] = {}
         self._lock = threading.Lock()
         self.shown: list[Shown] = []
@@ -91,10 +92,9 @@ class SampleLog:
         return self.shown[max(0, bisect.bisect([entry.at_ns for entry in self.shown], at_ns) - 1)].number
 
     def on_pose(self, at_ns: int) -> None:
-        """Show the next images after a pose of those that are shown now."""
+        """Have the next images shown after a pose of those that are shown now."""
         if self.shown and self.index(at_ns) == self._index:
-            self._step += 1
-            self._moved.set()
+            self._has_pose.set()
 
     @property
     def _index(self) -> int:
@@ -102,9 +102,12 @@ class SampleLog:
 
     def _run(self) -> None:
         while True:
-            self._moved.clear()
-            self._show(self._index)
-            self._moved.wait(REPEAT_S)
+            self._has_pose.clear()
+            for _ in range(MAX_REPEATS):
+                self._show(self._index)
+                if self._has_pose.wait(REPEAT_S):
+                    break
+            self._step += 1
 
     def _show(self, index: int) -> None:
         with self._lock:
