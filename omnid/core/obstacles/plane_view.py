@@ -135,7 +135,8 @@ class ShownBins(NamedTuple):
     fits: Floats  # and of those of them that fit best
     steps: Floats  # of grey across the bins
     greys: Floats
-    far: Floats  # (DIRECTIONS,) largest step beyond the last bin
+    far: Floats  # (DIRECTIONS,) largest step beyond the last bin,
+    near: Floats  # and best surface nearer than the first one
 
 
 def floor_plane(T_rect_floor: Array) -> FloorPlane:
@@ -255,7 +256,8 @@ class PlaneView:
         # 5. By bins. A surface that fits at a whole disparity is within half of one of it.
         at, of_surface = numbers // BINS_PER_PX, np.minimum((numbers + 1) // BINS_PER_PX, self.disparities - 1)
         stereo = floor[at], levels[:, at], surface[of_surface], fits[of_surface]
-        return ShownBins(self._of_bins(pair.seen), *stereo, steps[:count], greys[:count], far)
+        near = most[of_surface[0] + 2 :].max(axis=0, initial=0.0)
+        return ShownBins(self._of_bins(pair.seen), *stereo, steps[:count], greys[:count], far, near)
 
     def _of_bins(self, pixels: Flags) -> Flags:
         """Return bins (N, DIRECTIONS) whose pixels (H, DIRECTIONS) in both views are set."""

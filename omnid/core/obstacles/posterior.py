@@ -13,7 +13,7 @@ the last bin. Bins are half a disparity wide.
 3. Look of the floor: contrast, grey and outline of a bin, by those of floor that is known. Beyond the
    border of a patch of sun, or of another covering, it may look otherwise.
 4. The posterior (ray_kernels.posterior): sums along the ray. The end of the floor beyond the last bin shows a foot,
-   too; and something may begin nearer than the view: then it hides all, and shows no foot.
+   too; and something may begin nearer than the view: then it hides all, shows no foot, and may show its surface.
 
 All are log-likelihood ratios to "hidden behind something".
 """
@@ -96,7 +96,7 @@ def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -
     terms = np.where(seen, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
     terms[kernels.FITS] = fits
     lengths_m = np.diff(bins.ends_m).astype(np.float32)
-    kernels.posterior(terms, lengths_m, far, float(bins.ends_m[0]), first, ratios, view)
+    kernels.posterior(terms, lengths_m, far, shown.near, float(bins.ends_m[0]), first, ratios, view)
     surfaces = np.ascontiguousarray(shown.surface.T)
     return RayBelief(first, ratios, np.where(seen.T, view, np.float32(0)), surfaces, bins.ends_m)
 

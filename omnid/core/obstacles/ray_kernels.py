@@ -82,13 +82,14 @@ def log_sum(a: float, b: float) -> float:
 
 
 @compiled(
-    "(f4[:, :, ::1], f4[::1], f4[::1], f8, f4[:, ::1], f4[:, ::1], f4[:, ::1])",
+    "(f4[:, :, ::1], f4[::1], f4[::1], f4[::1], f8, f4[:, ::1], f4[:, ::1], f4[:, ::1])",
     writes=("first", "ratios", "view"),
 )
 def posterior(
     terms: Floats,
     lengths_m: Floats,
     far_edges: Floats,
+    near_surfaces: Floats,
     nearest_m: float,
     first: Floats,
     ratios: Floats,
@@ -99,8 +100,8 @@ def posterior(
 
     terms (8, N, D): log-likelihood ratios to something hidden, of floor by stereo, less those of planes above and
     below, of the look of floor, of floor and of something plain by edges, of what begins by its edge, and of surfaces.
-    lengths_m (N,) of the bins; far_edges (D,): sigmas of the largest step beyond the last bin; nearest_m: range of the
-    nearest floor in view.
+    lengths_m (N,) of the bins; far_edges (D,): sigmas of the largest step beyond the last bin; near_surfaces (D,):
+    log-likelihood ratios of the best surface nearer than the first; nearest_m: range of the nearest floor in view.
     """
     p = PARAMETERS
     bins, directions = terms.shape[1:]
@@ -124,7 +125,7 @@ def posterior(
     log_similar, log_other_look = math.log(p.similar), math.log1p(-p.similar)
     other_at_start = min(0.1 * p.changes_per_m * nearest_m, 0.5)
     log_known, log_other = math.log1p(-other_at_start), math.log(other_at_start)
-    log_nearer, log_2 = math.log(p.nearer), math.log(2.0)
+    log_nearer, log_nearest, log_2 = math.log(p.nearer), math.log(nearest_m), math.log(2.0)
     for u in range(directions):
         # 1. Sums from each bin to the last: planes beside the floor, look, and things behind the first one.
         plain = 0.0
@@ -172,8 +173,10 @@ def posterior(
             as_known, looks = kept, log_sum(kept, other_look)
         none = log_sum(before + looks + foot - log_2, slope + foot)
         # 6. Nearer than the view: the look of floor may have been learned from it, or it has one of its own.
-        #    What is plain shows fewer edges.
+        #    What is plain shows fewer edges. It may show a surface.
         nearer = log_nearer + log_sum(look[0], log_sum(0.0, plain) - log_2)
+        if near_surfaces[u] > 0.0:
+            nearer = log_sum(nearer, near_surfaces[u] - p.surface_noise + log_things + log_nearest)
         # 7. Something that hangs over floor in view: all that may begin beyond.
         beyond = high = none
         for n in range(bins - 1, -1, -1):

@@ -81,12 +81,13 @@ class Bar:
 
 @dataclass(frozen=True)
 class Block:
-    """Something low around the robot, of one grey level, with floor behind it."""
+    """Something low around the robot, of one grey level or with a pattern all over, with floor behind it."""
 
     range_m: float
     depth_m: float
     height_m: float
     grey: float = 75.0
+    pattern: Pattern | None = None
 
 
 @dataclass(frozen=True)
@@ -161,5 +162,10 @@ def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing:
         at_front_m = height_m + thing.range_m * rays[:, 2]
         on_top_m = r * (1 - thing.height_m / height_m)
         is_top = (on_top_m > thing.range_m) & (on_top_m < thing.range_m + thing.depth_m)
-        grey = np.where(is_top | ((at_front_m > 0) & (at_front_m < thing.height_m)), thing.grey, grey)
+        is_front = (at_front_m > 0) & (at_front_m < thing.height_m)
+        shown: float | np.ndarray = thing.grey
+        if thing.pattern is not None:
+            along_m = np.where(is_front, thing.range_m - at_front_m, np.minimum(on_top_m, wall_m))  # over its edge
+            shown = thing.pattern(along_m * np.cos(azimuth), along_m * np.sin(azimuth))
+        grey = np.where(is_top | is_front, shown, grey)
     return np.asarray(grey.reshape(columns.shape))

@@ -134,6 +134,13 @@ def test_something_low_begins_at_its_front(floor: Pattern) -> None:
 
 
 @pytest.mark.hazard("H19")
+def test_a_surface_nearer_than_the_floor_in_view_ends_the_way() -> None:
+    """Its top, which looks like the floor, hides the nearest floor in view, and ends beyond."""
+    scan = Standing(stains).scan(Block(0.7, 0.4, 0.5, pattern=stains), pairs=PAIRS)
+    assert scan.free_m.max() < 0.85
+
+
+@pytest.mark.hazard("H19")
 def test_floor_behind_a_white_wall_is_not_free() -> None:
     """It shows nothing itself but its foot."""
     wall = lambda azimuth, height_m: np.full(np.shape(azimuth), 200.0)  # noqa: E731
