@@ -239,9 +239,9 @@ class PlaneView:
         kernels.surface_evidence(lower, live, *self._bounds(upper), self._strips, surface)
         nearer, farther = (np.roll(surface, shift, axis=0) for shift in (-1, 1))
         surface = np.where((surface >= nearer) & (surface >= farther), surface, np.float32(0))
-        # 3. A surface that fits best in the weighted mean of neighbours counts as one.
+        # 3. A surface that fits best in the mean of neighbours counts as one; those next to its disparity count half.
         most = np.minimum(surface, PARAMETERS.surface_most)
-        three = np.maximum(most, np.maximum(np.roll(most, 1, 0), np.roll(most, -1, 0)))
+        three = np.maximum(most, np.maximum(np.roll(most, 1, 0), np.roll(most, -1, 0)) / 2)
         half = int(PARAMETERS.wide_columns) // 2
         wide = cv2.blur(turned(three, half), (2 * half + 1, 1), borderType=cv2.BORDER_REPLICATE)[:, half:-half]
         is_best = wide >= np.maximum(np.roll(wide, 1, 0), np.roll(wide, -1, 0))
