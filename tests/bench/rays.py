@@ -71,7 +71,7 @@ def main() -> None:
     for axes, world in zip(panels, names, strict=True):
         draw(axes, world, last_belief(world))
     panels[0].set_ylabel("range, m")
-    figure.savefig(file, dpi=75, pil_kwargs={"optimize": True})
+    figure.savefig(file, dpi=72, pil_kwargs={"optimize": True})
 
 
 if __name__ == "__main__":
