@@ -253,7 +253,7 @@ class PlaneView:
         kernels.floor_evidence(lower, upper, live, *bounds, rows, self._patches, self._offsets, others, levels)
         together = self._patches[:, kernels.PATCH_THIN, None].astype(np.float32)
         floor = -together * np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
-        # 5. By bins. A surface that fits at a whole disparity is within half of one of it.
+        # 5. By bins. A surface that fits at a whole disparity is within half of one of it; the next but one is nearer.
         at, of_surface = numbers // BINS_PER_PX, np.minimum((numbers + 1) // BINS_PER_PX, self.disparities - 1)
         stereo = floor[at], levels[:, at], surface[of_surface], fits[of_surface]
         near = most[of_surface[0] + 2 :].max(axis=0, initial=0.0)

@@ -187,8 +187,10 @@ class RayScans:
             self._on_ramp = self._seen(FloorPlane(floor.height_m + ramp.slope * start_m, a, b), self._on_ramp)
             on_ramp = self._on_ramp.shown(self._on_ramp.pair(lower, upper, lost))
             where = _is_beyond(start_m, way_rad, self._floor.bins.ranges_m)
+            near = np.where(where[0], on_ramp.near, shown.near)
             both = zip(shown, on_ramp, strict=True)
             shown = ShownBins(*(np.where(where if of.ndim > 1 else where[-1], theirs, of) for of, theirs in both))
+            shown = shown._replace(near=near)  # what begins before the ramp stands on the floor
         # 3. The belief, with the look of floor that is known, and the grid.
         known = self.grid.is_floor(pose, self._floor.bins.ranges_m)
         belief = ray_belief(shown, self._floor.bins, pair.sensor_grey, known)
