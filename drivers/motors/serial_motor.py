@@ -50,7 +50,7 @@ class LateReplyError(NoReplyError):
 
 
 class _State(Enum):
-    """What the next command finds, and what it becomes by an answer.
+    """What the next call of `send` does, and the state after an answer.
 
     | state      | next command                     | answer                                 |
     |------------|----------------------------------|----------------------------------------|
@@ -73,9 +73,9 @@ class _State(Enum):
 class SerialMotor:
     """The base on a serial port, locked for this program.
 
-    `send` blocks for at most timeout_s, SET_UP_S more where the controller is set up, plus the time to open the port
-    where it was gone; `close` for twice timeout_s. A command is sent once and never repeated: the caller
-    sends the next one at its own rate.
+    `send` blocks for at most timeout_s, as long again (SET_UP_S at least) where the controller is set up, plus the
+    time to open the port where it was gone; `close` for twice timeout_s. A command is sent once and never repeated: the
+    caller sends the next one at its own rate.
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
@@ -112,7 +112,7 @@ class SerialMotor:
         self._closed = False
         self._state = _State.GONE
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
-        self._fresh_s = 0.0  # after it: the watchdog cannot have expired
+        self._fresh_s = 0.0  # for this long after it, the watchdog cannot have expired
         self._waits, self._next_try_s = Backoff(), -math.inf
         self._problem = ""  # why the last try failed
         next(self._protocol.connect(watchdog_ms))  # what no controller can be asked for is an error at once

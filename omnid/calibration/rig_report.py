@@ -17,8 +17,7 @@ from omnid.calibration.snapshot import GREEN, RED
 from omnid.report.page import figure, page, table
 
 Row: TypeAlias = tuple[str, str, str]  # angle from the axis, corners, rms [px]
-# Factor by which residuals are drawn longer.
-ARROW = 40.0
+RESIDUAL_SCALE: Final = 40  # Factor by which residuals are drawn longer.
 
 
 def rig_report_html(found: RigCalibration, images: PairedImages) -> str:
@@ -44,14 +43,14 @@ def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
     image = images.sides[side][views[0][1]]
     canvas = cv2.cvtColor(image // 2, cv2.COLOR_GRAY2BGR)
     for k, _, starts in views:
-        arrows = ARROW * found.fit.residuals[k, side]
-        known = np.isfinite(starts + arrows).all(axis=1)
-        for start, end in np.rint([starts[known], (starts + arrows)[known]]).astype(int).swapaxes(0, 1).tolist():
+        ends = starts + RESIDUAL_SCALE * found.fit.residuals[k, side]
+        known = np.isfinite(ends).all(axis=1)
+        for start, end in np.rint([starts[known], ends[known]]).astype(int).swapaxes(0, 1).tolist():
             cv2.circle(canvas, start, 3, GREEN, 1, cv2.LINE_AA)
             cv2.line(canvas, start, end, RED, 1, cv2.LINE_AA)
     middle = tuple(round(value) for value in camera.center)
     cv2.drawMarker(canvas, middle, GREEN, cv2.MARKER_CROSS)
-    text = f"all corners; arrows are the residuals, {ARROW:.0f} times as long; the cross is the centre"
+    text = f"all corners; red lines are the residuals, {RESIDUAL_SCALE} times as long; the cross is the centre"
     return figure(np.asarray(canvas, np.uint8), f"{SIDES[side]}: {text}")
 
 

@@ -246,14 +246,14 @@ class StatusCollector:
         }
 
     def _pairing(self) -> Stats:
-        pair, images = self._pair, self._stages["pair"]
+        pair, stage = self._pair, self._stages["pair"]
         stats = pair.stats()
         missing = [name for name, stamp_ns in pair.newest_ns.items() if not self._age_s(stamp_ns) <= TIMEOUT_S]
         pairs_hz, broken_hz, *unpaired_hz = (
             self._rate_hz(name, stats[name]) for name in ("pairs", "broken", "unpaired_lower", "unpaired_upper")
         )
         processed_hz, dropped_hz = (
-            self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
+            self._rate_hz(f"pair {name}", getattr(stage, name)) for name in ("processed", "dropped")
         )
         frozen = stats["_frozen"]
         warnings = {
@@ -272,13 +272,17 @@ class StatusCollector:
     def _camera(self, name: Camera) -> Stats:
         state, age_s = self._cameras[name], self._age_s(self._pair.newest_ns[name])
         counts = ("frames", Key.DROPS, Key.ERRORS, "restamped", Key.RESTARTS, Key.LOSSES, "reopens")
-        is_late = state.status == "streaming" and not age_s <= TIMEOUT_S
+        error = ""
+        if state.status == "lost":
+            error = state.problem or "lost"
+        elif state.status == "streaming" and not age_s <= TIMEOUT_S:
+            error = "no new image"
         return {
             "mode": state.mode,
             Key.RATE_HZ: self._rate_hz(f"{name} frames", state.frames),
             Key.AGE_S: age_s,
             **{key: getattr(state, key) for key in counts},
-            "_error": state.problem or "lost" if state.status == "lost" else "no new image" if is_late else "",
+            "_error": error,
             "_ok": state.status,
         }
 

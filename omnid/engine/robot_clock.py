@@ -24,7 +24,7 @@ from omnid.engine.graph import Lock
 from omnid.engine.logging_setup import log
 
 STEP_NS: Final = 1_000_000  # less than two images of a pair are apart, more than NTP slews in a second
-KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
+KEPT: Final = 64  # offsets that are remembered: without steps, those of a minute at least
 
 
 class RobotClock:
@@ -89,7 +89,7 @@ class RobotClock:
     def stamp_ns(self, unix_ns: int) -> int:
         """Return the stamp of a Unix time: of all that have it, before and after a step, the nearest to now.
 
-        A Unix time that a step has left out is one of a clock that was not set: it counts by the newest offset.
+        A Unix time that a step has skipped was read from a clock that was not set: the newest offset applies to it.
         """
         self.follow()
         stamps = [unix_ns - offset_ns for _, offset_ns in tuple(self._offsets)]

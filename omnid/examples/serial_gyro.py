@@ -30,13 +30,13 @@ FRAME = "imu_link"  # not base_link: the robot turns the axes of this frame by i
 
 def rates_radps(received: bytearray) -> Iterator[tuple[float, float, float]]:
     """Remove the packets from the bytes; yield the angular velocities about x, y, z of the valid ones [rad/s]."""
-    while (start := received.find(b"\x55")) >= 0 and len(received) - start >= PACKET.size:
-        packet = bytes(received[start : start + PACKET.size])
-        _, kind, x, y, z, _, total = PACKET.unpack(packet)
-        if sum(packet[:-1]) & 0xFF != total:
-            del received[: start + 1]  # this byte was not the start of a packet
+    while len(received) >= PACKET.size:
+        packet = bytes(received[: PACKET.size])
+        start, kind, x, y, z, _, total = PACKET.unpack(packet)
+        if start != 0x55 or sum(packet[:-1]) & 0xFF != total:
+            del received[:1]  # this byte was not the start of a packet
             continue
-        del received[: start + PACKET.size]
+        del received[: PACKET.size]
         if kind == 0x52:
             yield x * RADPS_PER_UNIT, y * RADPS_PER_UNIT, z * RADPS_PER_UNIT
 

@@ -32,7 +32,7 @@ def service_file(name: str) -> str:
 
 
 def files_to_write(program: Path, *, page: bool = False, root: Path = Path("/")) -> dict[Path, str]:
-    """Return the texts of the files that are not there yet; OmnidError for a program that the units cannot start.
+    """Return the texts of missing files and of units that differ; OmnidError for a program that units cannot start.
 
     page: the unit of the page as well. root: the folder that stands for the system.
     """

@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | ControllerState | NavigationCommand
 
 REPEAT_NS = NS_PER_S  # An unchanged state is published again after this time.
-SCAN_NS = 2_000_000_000  # Older scans are not used; the collision monitor then stops the base.
+SCAN_NS = 2 * NS_PER_S  # Older scans are not used; the collision monitor then stops the base.
 
 
 class NavigationStage:
@@ -68,9 +68,9 @@ class NavigationStage:
         *,
         is_new: bool,
     ) -> None:
-        """collision: the outline of the base. map_name: of the map's file; empty: the map is not saved, so no route can
-        be tied to it. routes: by their names; a route that was taught is added. is_new: the map was empty before this
-        run, and its frame is odom at the start.
+        """collision: the outline of the base. T_base_rect: from the rectified frame, that of the map's keyframes.
+        map_name: of the map's file; empty: the map is not saved, so no route can be tied to it. routes: by their names;
+        a route that was taught is added. is_new: the map was empty before this run, and its frame is odom at the start.
         """
         self._settings, self._collision, self._T_base_rig = settings, collision, T_base_rig
         self._T_rig_base = se3.inverse(T_base_rig)
@@ -158,7 +158,7 @@ class NavigationStage:
         self.keyframes = update.keyframes or self.keyframes
 
     def _request(self, command: NavigationCommand) -> NavigationUpdate | None:
-        """Execute a request; return the new state with the answer, which for a finished route its writer gives."""
+        """Execute a request and return the new state with the answer; a finished route is answered by its writer."""
         word, taught, refusal = _word(command), self._taught, ""
         try:
             self._execute(command)
@@ -261,6 +261,7 @@ class NavigationStage:
                     f"odometry has begun again, so that the way of the route {recorder.name} is not known: teach it "
                     "again"
                 )
+            self._taught_resets = now.resets  # A place was recognised since the reset, so the map has its gap.
             recorder.add(now.pose_in(NavigationFrame.MAP), now.speed_mps, *keyframe)
         except OmnidError as error:
             self._recorder = None

@@ -23,7 +23,7 @@ KERNEL_OPTIONS = (
 
 
 class GuestError(Exception):
-    """The guest ended without a result: by a kernel panic, or at the timeout."""
+    """The guest ended without a result: by a kernel panic, an error of QEMU, or at the timeout."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Result:
             for case in ElementTree.fromstring(self.report).iter("testcase")
             if str(case.get("name")).partition("[")[0] == name
         ]
-        assert cases, f"it was not run:\n{self.output[-4000:]}"
+        assert cases, f"{name} was not run:\n{self.output[-4000:]}"
         if any(case.find(kind) is not None for case in cases for kind in ("failure", "error", "skipped")):
             raise AssertionError("\n".join(str(part.text) for case in cases for part in case))
 
@@ -63,7 +63,7 @@ def run_tests(
 
     systemd: PID 1; else only udev runs. files are copied to /mnt/job. /dev/ttyS1, ttyS2 and ttyS3 are connected to
     `serial`, as QEMU's -serial: "unix:/path" for a socket on which the caller listens. GuestError where the guest
-    panicked or took too long; ImageUnavailableError without QEMU or an image.
+    left no result; ImageUnavailableError without QEMU or an image.
     """
     words = ["python3", "-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "--durations=10"]
     words += ["--junitxml=/mnt/job/report.xml", "-o", "junit_logging=system-out", f"tests/hardware/guest/{script}"]
@@ -87,15 +87,15 @@ def run_tests(
                 stderr=subprocess.STDOUT,
                 timeout=timeout_s,
             )
-            console = done.stdout.decode("utf-8", "replace")
+            console, end = done.stdout.decode("utf-8", "replace"), f"QEMU ended with exit code {done.returncode}"
         except subprocess.TimeoutExpired as error:
-            console = (error.stdout or b"").decode("utf-8", "replace")
+            console, end = (error.stdout or b"").decode("utf-8", "replace"), f"no end within {timeout_s:g} s"
         # 3. The result.
         output = (job / "output").read_text("utf-8", "replace") if (job / "output").exists() else ""
         if not (job / "code").exists():
             panicked = "Kernel panic - not syncing" in console
-            reason = "the guest's kernel panicked" if panicked else f"the guest did not end within {timeout_s:g} s"
-            raise GuestError(f"{reason}\n{console[-4000:]}\n{output[-20000:]}")
+            reason = "the guest's kernel panicked" if panicked else end
+            raise GuestError(f"the guest left no result: {reason}\n{console[-4000:]}\n{output[-20000:]}")
         return Result(output, (job / "report.xml").read_bytes())
 
 

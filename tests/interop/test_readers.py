@@ -29,6 +29,8 @@ from omnid.transport.status_names import ODOMETRY, Key
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.live import recorded_run
 
+pytestmark = pytest.mark.interop
+
 START_NS = 1_700_000_000 * 10**9 + 123_456_789
 PERIOD_NS = 33_333_333
 COUNT = 7
@@ -95,8 +97,6 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> Iterator[tuple[str
 
 HERE = Path(__file__).parent
 TIMEOUT_S = 300.0
-
-
 NPM = ("package.json", "read_log.mjs")
 
 
@@ -210,18 +210,16 @@ def test_the_reader_reads_a_live_recording_as_rosbags_does(live: Path) -> None:
     assert found == expected
 
 
-pytestmark = pytest.mark.interop
-
-
 @pytest.mark.parametrize("topic", ["odom", "pose"])
 def test_others_read_the_poses_that_were_written(known: Known, tmp_path: Path, topic: str) -> None:
     found = trajectory(known.path, tmp_path, topic)
     wanted = known.expected[f"/omnid/{topic}"]
-    poses = [message["pose"]["pose"] if topic == "odom" else message["pose"] for message in wanted]
-    assert len(found) == len(poses)
-    for row, pose in zip(found, poses, strict=True):
-        np.testing.assert_allclose(row[1:4], list(pose["position"].values()), atol=1e-15)
-        np.testing.assert_allclose(row[4:], list(pose["orientation"].values()), atol=1e-15)
+    assert len(found) == len(wanted)
+    for row, message in zip(found, wanted, strict=True):
+        pose, stamp = message["pose"]["pose"] if topic == "odom" else message["pose"], message["header"]["stamp"]
+        numbers = [*pose["position"].values(), *pose["orientation"].values()]
+        np.testing.assert_allclose(row[1:], numbers, rtol=0, atol=1e-12)
+        assert row[0] == pytest.approx(stamp["sec"] + 1e-9 * stamp["nanosec"], rel=0, abs=1e-6)
 
 
 def trajectory(log: Path, folder: Path, topic: str) -> np.ndarray:

@@ -1,9 +1,9 @@
 """Range scan: the nearest obstacle in each direction, as a planar laser scanner would see it.
 
-`point_scan` makes one of the points of a pair, for the map and its keyframes. Points of the floor, and those under
-which the robot passes, are removed by their height, with a margin that grows with the range: by the noise of stereo
-along the slanting ray, and by the tilt of the base. Points are counted in bins of inverse range, in which the noise of
-stereo is the same at all ranges (sigma_r = r^2 / (f t) sigma_d).
+`point_scan` computes the scan of the points of a pair, for the map and its keyframes. Points of the floor, and those
+under which the robot passes, are removed by their height, with a margin that grows with the range: by the noise of
+stereo along the slanting ray, and by the tilt of the base. Points are counted in bins of inverse range, in which the
+noise of stereo is the same at all ranges (sigma_r = r^2 / (f t) sigma_d).
 """
 
 from __future__ import annotations
@@ -66,7 +66,6 @@ def point_scan(
     """Return the scan (SECTORS,) of points (N, 3) [m] in the level frame of the base; z is the height above the floor.
 
     A range is that of the nearest obstacle up to MAX_RANGE_M, m; NaN: unknown.
-
     sigma_m (N,): of the points, along the rays; view (3,): the viewpoint in that frame; heights_m: of obstacles above
     the floor; tilt_rad: sigma of the base's tilt against it; min_points: least number of points of an obstacle.
     """
@@ -107,5 +106,5 @@ def point_scan(
 
 
 def _sectors(x: Array, y: Array) -> NDArray[np.intp]:
-    """Return the sectors (N,) of places (N,)."""
+    """Return the sectors (N,) in which points at x (N,), y (N,) [m] from the base lie."""
     return np.floor((np.arctan2(y, x) + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS

@@ -21,11 +21,11 @@ from tests.simulation.recipes import mild_rig
 LAW_RANGES = ExposureRanges(ValueRange(100, 200_000, 100), ValueRange(0, 100))
 SCENE = np.random.default_rng(4).lognormal(0.0, 0.5, 400)  # radiances, mean about 1.1
 START = ExposureSetting(5000, 0)
-LAW_PERIOD_NS = 250_000_000  # of the pairs; more would be skipped
+LAW_PERIOD_NS = 250_000_000  # between two pairs; the law takes a step at most once in STEP_S
 
 
 class Sensor:
-    """A camera: grey = 255 * (light * exposure * gain)^gamma, saturated; decibels: gain 100 is a factor of 16."""
+    """A camera: grey = 255 * (light * exposure * gain)^gamma, saturated; in decibels the gain 100 is a factor of 16."""
 
     def __init__(
         self, light: float, *, gamma: float = 1.0, linear_gain: bool = False, scene: np.ndarray = SCENE
@@ -100,8 +100,8 @@ def area(rig: Rig) -> UsefulArea:
     return UsefulArea(rig, fit_cylinder(rig))
 
 
-class Robot:
-    """Two cameras under one light, which carry out requests as the driver does, and their regulation."""
+class LitCameras:
+    """Two cameras under one light, which carry out requests as the driver does, and the control of their exposure."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class Robot:
         self.pairs, self.stamp_ns = 0, 0
         self.unequal = 0  # pairs of images with different exposures
 
-    def drive(self, seconds: float) -> DiagnosticStatus:
+    def run(self, seconds: float) -> DiagnosticStatus:
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             self.pairs += 1
             self.stamp_ns += PERIOD_NS
@@ -150,19 +150,19 @@ class Robot:
 
 
 def test_both_cameras_get_the_same_values_between_two_pairs(area: UsefulArea) -> None:
-    robot = Robot(area, 0.03)
-    status = robot.drive(15.0)
+    lit = LitCameras(area, 0.03)
+    status = lit.run(15.0)
     assert status.level == OK and 60 < float(status.values["lower_grey"]) < 140, status
     assert float(status.values["exposure_ms"]) == 20.0 and int(status.values["gain"]) > 0
-    assert int(status.values["steps"]) > 2 and robot.unequal == 0
+    assert int(status.values["steps"]) > 2 and lit.unequal == 0
 
 
 def test_the_status_says_what_to_do_where_it_is_too_dark_or_too_bright(area: UsefulArea) -> None:
-    robot = Robot(area, 0.0)
-    status = robot.drive(15.0)
+    lit = LitCameras(area, 0.0)
+    status = lit.run(15.0)
     assert status.level == WARN and status.message.startswith("too dark") and "lights" in status.values["remedy"]
-    robot.light = 1e4
-    status = robot.drive(25.0)
+    lit.light = 1e4
+    status = lit.run(25.0)
     assert status.level == WARN and status.message.startswith("too bright") and "shade" in status.values["remedy"]
 
 
@@ -175,20 +175,20 @@ def test_the_status_says_what_to_do_where_it_is_too_dark_or_too_bright(area: Use
 def test_the_exposure_is_left_to_the_cameras_and_the_status_says_why(
     area: UsefulArea, config: CamerasConfig, ranges: tuple[ExposureRanges | None, ExposureRanges | None], words: str
 ) -> None:
-    robot = Robot(area, 0.5, config, ranges)
-    status = robot.drive(5.0)
+    lit = LitCameras(area, 0.5, config, ranges)
+    status = lit.run(5.0)
     assert status.level == OK and words in status.message and "exposure_ms" not in status.values
-    assert all(state.exposure is None or state.exposure.request is None for state in robot.cameras.values())
+    assert all(state.exposure is None or state.exposure.request is None for state in lit.cameras.values())
 
 
 def test_cameras_that_refuse_an_exposure_get_their_own_back(area: UsefulArea) -> None:
-    robot = Robot(area, 0.3)
-    robot.drive(1.0)
-    exposure = robot.cameras["upper"].exposure
+    lit = LitCameras(area, 0.3)
+    lit.run(1.0)
+    exposure = lit.cameras["upper"].exposure
     assert exposure is not None
     exposure.problem = "it refused an exposure (Invalid argument)"
-    assert "it refused an exposure" in robot.drive(3.0).message
-    for one in robot.cameras.values():
+    assert "it refused an exposure" in lit.run(3.0).message
+    for one in lit.cameras.values():
         assert one.exposure is not None and one.exposure.request is not None and one.exposure.request.setting is None
 
 

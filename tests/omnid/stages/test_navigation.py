@@ -57,7 +57,7 @@ def fixed_map(
     routes: dict[str, Route] | None = None,
     is_new: bool = False,
 ) -> NavigationStage:
-    """Return a stage in a map with one keyframe, which stands still."""
+    """Return a stage in a map with one keyframe, which is never moved."""
     routes = {} if routes is None else routes
     stage = NavigationStage(settings, collision, T_base_rig, np.eye(4), "site.omap", routes, is_new=is_new)
     stage.keyframes = MapKeyframes({3: stamp_ns}, {3: np.eye(4)})
@@ -282,6 +282,21 @@ def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path
             answer = robot.updates[-1].answer
             assert answer is not None and "teach it again" in answer.refusal and not robot.updates[-1].teaching
             assert "not localised" in robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer.refusal
+
+
+def test_a_route_is_taught_on_after_a_reset_once_a_place_was_recognised(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.send(RouteRequest(RouteAction.TEACH, "hall"))
+    robot.velocity = np.array([0.3, 0.0])
+    for robot.resets, robot.map_state in (
+        (0, MapState.LOCALIZED),
+        (1, MapState.LOCALIZED),
+        (1, MapState.ODOMETRY_ONLY),
+    ):
+        for _ in range(20):
+            robot.pass_on()
+    assert robot.updates[-1].teaching == "hall" and robot.updates[-1].taught_m == pytest.approx(1.8, abs=0.2)
 
 
 @pytest.mark.hazard("H28")

@@ -19,7 +19,7 @@ from calib.errors import CalibError
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.names import values_of
-from calib.models.ocam import OcamCamera
+from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from tests.simulation.boards import board_poses_around_camera, board_poses_around_rig
@@ -86,8 +86,8 @@ def one_sided(camera: OmniCamera, noise_px: float = 0.0, seed: int = 0) -> list[
 
 @pytest.mark.parametrize("truth", [OCAM, DIRECT, PINHOLE])
 def test_the_fit_recovers_one_camera_of_any_kind(truth: OmniCamera) -> None:
-    view = "direct" if truth in (DIRECT, PINHOLE) else "mirror"
-    found = calibrate_boards(one_sided(truth), ODD, [SIZE], "direct" if view == "direct" else "mirror").cameras[0]
+    view: View = "direct" if truth in (DIRECT, PINHOLE) else "mirror"
+    found = calibrate_boards(one_sided(truth), ODD, [SIZE], view).cameras[0]
     angles, radii = np.meshgrid(np.arange(0, 6.2, 0.5), np.linspace(80, 340, 9))
     pixels = np.column_stack([(394 + radii * np.cos(angles)).ravel(), (381 + radii * np.sin(angles)).ravel()])
     a, b = found.lift(pixels), truth.lift(pixels)
@@ -148,10 +148,7 @@ def test_too_few_views_and_pairs_are_refused() -> None:
 
 @pytest.mark.parametrize(
     "shape",
-    [
-        AS_DRAWN,
-        PrintShape((3e-3, 0.0, 0.0, 0.003)),
-    ],
+    [AS_DRAWN, PrintShape((3e-3, 0.0, 0.0, 0.003))],
 )
 def test_the_shape_of_the_print_is_found_and_leaves_the_rig_as_it_is(shape: PrintShape) -> None:
     found = calibrated(pairs(ODD, 14, 0.01, shape=shape))

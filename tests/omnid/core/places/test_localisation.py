@@ -1,4 +1,4 @@
-"""A drive there and back along a corridor whose odometry drifts: the map corrects it, and says what it knows."""
+"""A drive there and back along a corridor whose odometry drifts: the map corrects it, and states what is known."""
 
 from __future__ import annotations
 
@@ -12,12 +12,7 @@ import pytest
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.localisation import (
-    SEARCHES,
-    MapLocaliser,
-    MapPose,
-    OdometryFrame,
-)
+from omnid.core.places.localisation import SEARCHES, MapLocaliser, MapPose, OdometryFrame
 from omnid.core.places.place_map import PlaceLimits
 from omnid.tracking_state import MapState
 from tests.omnid.core.scenery import Array, RenderedCameras, motion_errors
@@ -26,7 +21,7 @@ from tests.simulation.paths import planar_poses
 
 STEP_M = 0.2
 OUT = np.arange(0.0, 4.2, STEP_M)
-# The way back is 0.15 m aside, in the opposite direction.
+# The way back is 0.15 m to the left of the way out, in the opposite direction.
 XY = np.concatenate([np.column_stack([OUT, 0 * OUT]), np.column_stack([OUT[::-1], 0 * OUT + 0.15])])
 POSES = planar_poses(XY, np.repeat([0.0, np.pi], len(OUT)))
 DRIFT = se3.exp([0.004, 0.003, 0.0, 0, 0, np.deg2rad(0.08)])  # of each step
@@ -120,7 +115,7 @@ def test_a_robot_that_was_carried_away_is_localised_again(frames: list[StereoFra
 def test_a_motion_that_odometry_missed_is_found_by_the_places_that_contradict_it(
     cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
 ) -> None:
-    """As after a lift, or on wheels that slip in the dark: before, it was localised, 1.2 m off, for the whole run."""
+    """As after a lift, or on wheels that slip in the dark."""
     carried_m, seen = 1.2, [*range(7), *range(13, len(POSES))]
     true, by_odometry = POSES[seen], POSES[seen].copy()
     by_odometry[7:, 0, 3] -= carried_m
@@ -134,7 +129,8 @@ def test_a_motion_that_odometry_missed_is_found_by_the_places_that_contradict_it
         for pose, frame, T in zip(found, drive, truth, strict=True)
     ]
     was_wrong = [k for k in range(7, len(found)) if found[k].is_known and error_m[k] > 0.5]
-    assert was_wrong and not found[was_wrong[-1] + 1].is_known, "first it does not know better, then it says so"
+    # First the wrong pose is trusted, then it is reported as unknown.
+    assert was_wrong and not found[was_wrong[-1] + 1].is_known
     assert found[-1].state is MapState.LOCALIZED and error_m[-1] < 0.25
     # Keyframes that were placed wrongly are not saved.
     at = {frame.stamp_ns: T for frame, T in zip(drive, truth, strict=True)}
@@ -143,10 +139,10 @@ def test_a_motion_that_odometry_missed_is_found_by_the_places_that_contradict_it
     assert new and max(motion_errors(kept.poses[one.id], at[one.stamp_ns])[0] for one in new) < 0.5
 
 
-def test_a_robot_that_stands_in_the_dark_knows_where_it_is_when_there_is_light(
+def test_a_robot_at_rest_in_the_dark_is_localised_when_there_is_light(
     cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
 ) -> None:
-    """However long it was dark."""
+    """However long it was dark: longer than all searches of the dark images take."""
     at, dark, light = len(OUT) + 8, SEARCHES + 2, 4
     localiser = MapLocaliser(cameras.model, PlaceLimits(), deepcopy(out).places)
     seen = [cameras.darkness(400)] * dark + [frames[at]] * light

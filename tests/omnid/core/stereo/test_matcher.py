@@ -98,18 +98,18 @@ def test_two_depths_side_by_side_are_found(method: str) -> None:
 
 
 def test_the_search_follows_columns_that_have_moved() -> None:
-    """A pair that is not synchronised: near points appear aside in the upper panorama, by a known shift."""
-    lower, aside_px = texture(21, SHAPE, 1.2), 2.0
-    upper = np.roll(turned(lower, aside_px), SHIFT_PX, axis=0)
+    """A pair that is not synchronised: near points are shifted to the side in the upper panorama, by a known amount."""
+    lower, sideways_px = texture(21, SHAPE, 1.2), 2.0
+    upper = np.roll(turned(lower, sideways_px), SHIFT_PX, axis=0)
     expected = ColumnShift(
-        np.full(SHAPE, aside_px / 2, np.float32), np.full(SHAPE, aside_px / 2 / SHIFT_PX, np.float32)
+        np.full(SHAPE, sideways_px / 2, np.float32), np.full(SHAPE, sideways_px / 2 / SHIFT_PX, np.float32)
     )
     matcher = Matcher(SHAPE, MatchingSettings(disparities=DISPARITIES))
     errors = [
         np.abs(matcher.match(lower, upper, middle(), column_shift=shift)[1] - SHIFT_PX) for shift in (expected, None)
     ]
     assert len(errors[0]) > 500 and np.mean(errors[0] < 0.2) > 0.85
-    assert np.mean(errors[1] < 0.2) < 0.6  # without it
+    assert np.mean(errors[1] < 0.2) < 0.6
 
 
 Array = NDArray[np.float64]

@@ -41,10 +41,10 @@ def test_a_stalled_stage_stops_the_watchdog_and_is_logged_once(
     caplog.set_level(logging.INFO, "omnid")
     stage = StageStats()
     service = Service({"valve": stage, "idle": StageStats()}, RunStatistics(), 0.5)
-    stage.busy_since_ns = time.monotonic_ns()
+    stage.busy_since_ns = time.monotonic_ns()  # It has just begun.
     service()
     line = "0.00 m, waiting for images, 0 messages dropped"
-    assert received() == ["READY=1", "WATCHDOG=1", f"STATUS={line}"], "it has only just begun"
+    assert received() == ["READY=1", "WATCHDOG=1", f"STATUS={line}"]
     stage.busy_since_ns -= 10**9
     for _ in range(2):
         service()
