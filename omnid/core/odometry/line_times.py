@@ -22,7 +22,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.pose_estimation import CORRELATED, KERNEL_WIDTH, VIEW
@@ -107,9 +106,8 @@ class LineTimes:
         every = round(CORRELATED)
         chosen = np.arange(seq % every, len(seen.landmarks), every)
         table, rows = local_map.table, seen.landmarks[chosen]
-        T_curr_anchor = local_map.from_anchors(se3.inverse(seen.T_odom_rect), rows)
+        points, T_curr_anchor = local_map.seen(seen.T_odom_rect, rows)
         at_anchor, R = table.anchor_points[rows], T_curr_anchor[:, :3, :3]
-        points = (R @ at_anchor[:, :, None])[:, :, 0] + T_curr_anchor[:, :3, 3]
         error = seen.views[chosen] - view(points, cylinder, baseline_m)
         error[:, 0] = cylinder.wrap(error[:, 0])
         J = view_jacobian(points, cylinder, baseline_m)

@@ -177,10 +177,8 @@ class LocalMap:
         disparity = views[:, 2] - views[:, 1] + J @ (velocity.twist - estimate.assumed.twist)
         variance = estimate.variance[kept] + np.einsum("ni,ij,nj->n", J, velocity.covariance, J)
         # 1. The disparity f t / r as predicted, and its derivatives by the point in the anchor.
-        T_curr_anchor = self.from_anchors(se3.inverse(estimate.T_odom_rect), rows)
-        points = self.table.anchor_points[rows]
-        P = self.table.anchor_covariance[rows]
-        seen = (T_curr_anchor[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_curr_anchor[:, :3, 3]
+        seen, T_curr_anchor = self.seen(estimate.T_odom_rect, rows)
+        points, P = self.table.anchor_points[rows], self.table.anchor_covariance[rows]
         r2 = np.maximum((seen[:, :2] ** 2).sum(axis=1), MIN_RADIUS**2)
         predicted = self._model.cylinder.focal_px * self._model.baseline_m / np.sqrt(r2)
         H = np.einsum("ni,nij->nj", -(predicted / r2)[:, None] * seen[:, :2], T_curr_anchor[:, :2, :3])
@@ -195,10 +193,10 @@ class LocalMap:
 
     def _place(self, rows: Indices, points: Array, covariance: Array) -> None:
         """Set points (M, 3) and covariances (M, 3, 3) of landmarks (rows) in their anchors, and so in odom."""
-        table, T_odom_anchor = self.table, self.from_anchors(np.eye(4), rows)
+        table = self.table
         table.anchor_points[rows], table.anchor_covariance[rows] = points, covariance
+        table.points[rows], T_odom_anchor = self.seen(np.eye(4), rows)
         R = T_odom_anchor[:, :3, :3]
-        table.points[rows] = (R @ points[:, :, None])[:, :, 0] + T_odom_anchor[:, :3, 3]
         table.covariance[rows] = R @ covariance @ np.swapaxes(R, 1, 2)
 
     def update_tracked(self, lower: PaddedPanorama, rows: Indices, pixels: Array) -> None:
@@ -218,11 +216,16 @@ class LocalMap:
         """Remove landmarks (rows of the table)."""
         self._select(~np.isin(np.arange(len(self)), rows))
 
-    def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
-        """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""
+    def from_anchors(self, T_odom_rect: Array, rows: Indices) -> Array:
+        """Return the transforms (M, 4, 4) into the frame with a pose, from the anchors of landmarks (rows)."""
         seqs = sorted(self.keyframes)
-        poses = np.array([self.keyframes[seq].T_odom_rect for seq in seqs]).reshape(-1, 4, 4)
-        return np.asarray((T_rect_odom @ poses)[np.searchsorted(np.array(seqs, np.intp), self.table.anchor[rows])])
+        poses = se3.inverse(T_odom_rect) @ np.array([self.keyframes[seq].T_odom_rect for seq in seqs]).reshape(-1, 4, 4)
+        return np.asarray(poses[np.searchsorted(np.array(seqs, np.intp), self.table.anchor[rows])])
+
+    def seen(self, T_odom_rect: Array, rows: Indices) -> tuple[Array, Array]:
+        """Return landmarks (M, 3) [m] in the frame with a pose, by their places in the anchors; and `from_anchors`."""
+        T = self.from_anchors(T_odom_rect, rows)
+        return (T[:, :3, :3] @ self.table.anchor_points[rows][:, :, None])[:, :, 0] + T[:, :3, 3], T
 
     def _set_rows(self, rows: NDArray[np.void]) -> None:
         """Set the rows (N,) of LANDMARK; the columns of the table are views of them."""
@@ -294,7 +297,7 @@ class LocalMap:
         predicted (M, 2): their pixels by that pose. A patch is found where it has texture and moved by less than
         reach_px from there. upper: it is the upper panorama.
         """
-        table, T_curr_ref = self.table, self.from_anchors(se3.inverse(T_odom_rect), landmarks)
+        table, T_curr_ref = self.table, self.from_anchors(T_odom_rect, landmarks)
         templates = np.empty((len(landmarks), WINDOW_PX + 2, WINDOW_PX + 2), np.float32)
         surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
         maps = plane_maps(surfaces, T_curr_ref, predicted, self._model, upper=upper)
@@ -305,7 +308,7 @@ class LocalMap:
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:
         """Return the slopes (M, 2) of the disparity of landmarks (M,) [px/px] in a panorama with that pose."""
-        table, T_curr_ref = self.table, self.from_anchors(se3.inverse(T_odom_rect), landmarks)
+        table, T_curr_ref = self.table, self.from_anchors(T_odom_rect, landmarks)
         return moved_slopes((table.anchor_points[landmarks], table.slopes[landmarks]), T_curr_ref, self._model)
 
     def error_of(self, estimate: PoseEstimate) -> Array:

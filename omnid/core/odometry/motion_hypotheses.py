@@ -73,9 +73,6 @@ class OtherMotion:
         The first candidate is the pose that was found first, the others are of peaks. sigma_mps: standard deviation of
         the predicted velocity.
         """
-        if not self.is_open and len(candidates) == 1:
-            self.velocity = np.zeros(3)
-            return candidates[0]
         # 1. Candidates that the images allow.
         best = min(candidates, key=lambda each: each.cost)
         likely = [

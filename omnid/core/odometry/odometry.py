@@ -170,8 +170,7 @@ class VisualOdometry:
             self._exposure(frame, dt_s),
         )
         if self._map.last is None:
-            carried = dt_s > 0 and self._carry(now)
-            return self._start_map(now, carried=carried)
+            return self._start_map(now, carried=dt_s > 0 and self._carry(now))
 
         # 2. to 4. Track, estimate and refine: pose_search.py. Once a frame was refused, those without corners
         #    (darkness, a blank wall) are left out to save time.
@@ -302,12 +301,6 @@ class VisualOdometry:
         self._T_at_fix, self._since_fix_s, self._is_unknown = self._T_odom_rect, 0.0, False
         self._refused_s = self._unmatched_s = None
 
-    def _miss(self, dt_s: float, *, is_lost: bool, carried: bool) -> None:
-        """Set the state of a frame without a pose; carried: wheels and gyro carry the pose."""
-        self._state = TrackingState.LOST if is_lost and not carried else TrackingState.DEGRADED
-        self._since_fix_s += dt_s
-        self._is_unknown |= self._T_at_fix is not None and not carried
-
     def _refuse(self, now: _Prediction, found: list[PoseEstimate], gap: Array | None) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
@@ -316,25 +309,25 @@ class VisualOdometry:
         """
         # 1. Go on to the predicted pose. Of a gap without frames no more than max_gap_s counts, because nothing could
         #    be seen in it.
-        limits, step_s, was_unknown = self._limits, min(now.dt_s, self._limits.max_gap_s), self._is_unknown
+        limits, step_s = self._limits, min(now.dt_s, self._limits.max_gap_s)
         carried = self._carry(now) and gap is None
+        self._is_unknown |= not carried
         self._refused_s = 0.0 if self._refused_s is None else self._refused_s + step_s
         is_lost = self._refused_s >= limits.lost_s
         if is_lost and self._is_textured(now):
             self._unmatched_s = 0.0 if self._unmatched_s is None else self._unmatched_s + step_s
         is_unmatched = self._unmatched_s is not None and self._unmatched_s >= limits.restart_s
         restarts = is_lost and (gap is not None or is_unmatched)
-        self._miss(now.dt_s, is_lost=is_lost, carried=carried)
-        # 2. Whether the predicted pose would have the old map in view, and most of the tracks, few as they may be, do
-        #    not show it there.
-        if restarts and self._T_at_fix is not None and _keeps_view(self._T_at_fix, now.T_odom_rect):
-            is_shown = bool(found) and found[0].inlier_ratio > 0.5
-            self._is_unknown |= not (is_shown and _keeps_view(now.T_odom_rect, found[0].T_odom_rect))
-        if carried and self._is_unknown and not was_unknown:
-            # What carried the pose is contradicted now, and has measured nothing since the last fix.
-            self._motion.distrust((UNKNOWN_SPEED_SIGMA * self._since_fix_s) ** 2 * np.eye(6))
+        self._state = TrackingState.LOST if is_lost and not carried else TrackingState.DEGRADED
         if not restarts:
             return self._result(0, 0, self._exposure(now.frame))
+        # 2. Whether wheels and gyro, which say that the old map is in view, are contradicted: most of the tracks, few
+        #    as they may be, do not show it there. Then they have measured nothing since the last fix.
+        if not self._is_unknown and self._T_at_fix is not None and _keeps_view(self._T_at_fix, now.T_odom_rect):
+            is_shown = bool(found) and found[0].inlier_ratio > 0.5
+            if not (is_shown and _keeps_view(now.T_odom_rect, found[0].T_odom_rect)):
+                self._is_unknown = True
+                self._motion.distrust((UNKNOWN_SPEED_SIGMA * self._since_fix_s) ** 2 * np.eye(6))
         # 3. Start the map again.
         self._map.clear()
         self._relocaliser.clear()
@@ -342,14 +335,17 @@ class VisualOdometry:
             self._motion.distrust(np.outer(gap, gap))
         if self._is_unknown:
             self._motion.reset()
-        return self._start_map(replace(now, dt_s=0.0), carried=carried, is_elsewhere=gap is not None)
+        return self._start_map(now, carried=carried, is_elsewhere=gap is not None)
 
     def _carry(self, now: _Prediction) -> bool:
         """Go on to the predicted pose; return whether wheels and gyro carry it."""
         limits, self._T_odom_rect = self._limits, now.T_odom_rect
-        return self._motion.carry(
+        carried = self._motion.carry(
             now.dt_s, is_measured=now.is_measured, most_s=limits.bridge_s, most_sigma_m=limits.bridge_sigma_m
         )
+        self._since_fix_s += now.dt_s
+        self._is_unknown |= self._T_at_fix is not None and not carried
+        return carried
 
     def _start_map(self, now: _Prediction, *, carried: bool, is_elsewhere: bool = False) -> OdometryEstimate:
         """Start a map at the current pose if the frame has enough landmarks."""
@@ -359,13 +355,12 @@ class VisualOdometry:
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._refused_s = self._unmatched_s = None
-            self._miss(now.dt_s, is_lost=True, carried=carried)
+            self._state = TrackingState.DEGRADED if carried else TrackingState.LOST
             return self._result(0, 0, exposure)
         self._first = None if now.frame.times.is_synchronised else now
         self._motion.found(self._motion.pose_covariance)
         # A map that replaces a lost one says nothing about the motion between the two.
-        is_unknown = self._is_unknown or (self._T_at_fix is not None and not carried)
-        self._fix(is_doubtful=is_unknown and not is_elsewhere, is_reset=is_unknown)
+        self._fix(is_doubtful=self._is_unknown and not is_elsewhere, is_reset=self._is_unknown)
         return replace(self._result(len(self._map), len(self._map), exposure), is_keyframe=True)
 
     def _make_keyframe(self, now: _Prediction, exposure: Exposure, seen: PoseEstimate | None = None) -> None:
