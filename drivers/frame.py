@@ -13,7 +13,7 @@ import numpy as np
 import simplejpeg  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from drivers.errors import FrameDecodeError
+from drivers.errors import FrameDecodeError, one_line
 from drivers.jpeg import Steps, quantisation_steps
 
 Camera = Literal["lower", "upper"]
@@ -91,8 +91,7 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
         image = {"jpeg": _of_jpeg, "png": _of_png}.get(frame.encoding, _of_raw)(frame, data)
     except (cv2.error, ValueError, TypeError, BufferError, OverflowError, MemoryError) as error:
         raise FrameDecodeError(
-            f"{frame.camera} frame {frame.seq} ({frame.encoding[:40]!r}) cannot be decoded: "
-            f"{' '.join(str(error).split())[:300]}"
+            f"{frame.camera} frame {frame.seq} ({frame.encoding[:40]!r}) cannot be decoded: {one_line(error)}"
         ) from error
     image.setflags(write=False)
     return image
@@ -148,8 +147,7 @@ def _of_raw(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if step < row_bytes:
         raise ValueError(f"its step is {step} bytes, a row of {frame.width} px takes {row_bytes}")
     if data.size < step * (frame.height - 1) + row_bytes:
-        size = f"{frame.width} x {frame.height} px take {step * frame.height}"
-        raise ValueError(f"it has {data.size} bytes, {size}")
+        raise ValueError(f"it has {data.size} bytes, {frame.width} x {frame.height} px take {step * frame.height}")
     shape, strides = (frame.height, frame.width, channels), (step, pixel_bytes, dtype.itemsize)
     pixels: NDArray[Any] = np.ndarray(shape, dtype, buffer=data.data, strides=strides)
     if channels == 1 or frame.encoding in _LUMA:

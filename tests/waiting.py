@@ -16,11 +16,11 @@ PATIENCE_S = 60.0  # timeout of a wait; not a measured time
 
 
 def wait_until(
-    happens: Callable[[], object], what: str = "it", patience_s: float = PATIENCE_S, *, pause_s: float = 0.02
+    condition: Callable[[], object], what: str = "it", patience_s: float = PATIENCE_S, *, pause_s: float = 0.02
 ) -> None:
-    """Return once it happens; raise AssertionError after the timeout."""
+    """Return once the condition is true; raise AssertionError, with what was waited for, after the timeout."""
     deadline_s = time.monotonic() + patience_s
-    while not happens():
+    while not condition():
         assert time.monotonic() < deadline_s, f"{what} did not happen within {patience_s:g} s"
         time.sleep(pause_s)
 
@@ -30,8 +30,9 @@ def running(
     command: Sequence[object], environment: Mapping[str, str] | None = None, *, stdin: int | None = None
 ) -> Iterator[subprocess.Popen[str]]:
     """Yield a process of this source tree, whose output is piped; it is killed at the end of the block."""
-    words, pipe, its = [*map(str, command)], subprocess.PIPE, {"PYTHONPATH": str(ROOT), **(environment or {})}
-    with subprocess.Popen(words, stdin=stdin, stdout=pipe, stderr=pipe, text=True, env=os.environ | its) as process:
+    words, pipe = [*map(str, command)], subprocess.PIPE
+    variables = os.environ | {"PYTHONPATH": str(ROOT), **(environment or {})}
+    with subprocess.Popen(words, stdin=stdin, stdout=pipe, stderr=pipe, text=True, env=variables) as process:
         try:
             yield process
         finally:

@@ -91,8 +91,10 @@ def _stamped(folder: Path) -> list[tuple[int, Path]]:
             raise DriverError(f"cannot read the stamps {str(lists[0])!r}: {error.strerror}") from error
         texts = [line for line in lines if line and not line.startswith("#")]
         if len(texts) != len(paths):
-            found = f"{len(paths)} images, and its list of stamps {len(texts)} lines"
-            raise DriverError(f"{str(folder)!r} contains {found}; they must be as many")
+            raise DriverError(
+                f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(texts)} lines: "
+                "they must be as many"
+            )
     return [(_stamp_ns(text, path), path) for text, path in zip(texts, paths, strict=True)]
 
 
@@ -103,8 +105,8 @@ def _stamp_ns(text: str, image: Path) -> int:
         if 0 <= stamp_ns < LATEST_NS and "_" not in text:
             return int(stamp_ns)
     raise DriverError(
-        f"{str(image)!r} has no stamp: expected nanoseconds of 16 to 19 digits as its name, or a line for each image "
-        f"with its seconds in {_LISTS[0]}"
+        f"{str(image)!r} has no stamp: expected as its name nanoseconds of 16 to 19 digits, or seconds with a decimal "
+        f"point; or a line for each image with its seconds in {_LISTS[0]}"
     )
 
 

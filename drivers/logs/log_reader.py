@@ -204,9 +204,9 @@ def choose_stamps(
     if source != "auto":
         return stamps_ns, ""
     # 2. Times that are wrong.
-    for of_it in of_camera.values():
-        of_it = of_it & (header_ns >= 0)
-        steps_ns, is_repeated = np.diff(stamps_ns[of_it]), np.diff(log_ns[of_it]) == 0
+    for is_image in of_camera.values():
+        known = is_image & (header_ns >= 0)
+        steps_ns, is_repeated = np.diff(stamps_ns[known]), np.diff(log_ns[known]) == 0
         wrong = np.flatnonzero((steps_ns < 0) | ((steps_ns == 0) & ~is_repeated)).tolist()
         step_ns = np.median(steps_ns[steps_ns > 0]) if (steps_ns > 0).any() else _SHORTEST_STEP_NS
         if wrong or step_ns < _SHORTEST_STEP_NS:
@@ -287,7 +287,7 @@ class LogReader:
         cameras = {topic: camera for camera, topic in self.topics.items()}
         rows, stamps_ns, is_image, warning = self._order
         self.counts, self.warnings, faults = Counter(), [*self._motion_warnings], dict[str, str]()
-        # 1. The part that is read, from the first image to the last one: samples behind it are of no use.
+        # 1. The part that is read, from the first image to the last one: samples after it are of no use.
         first_ns = int(stamps_ns[is_image].min(initial=stamps_ns.max(initial=0)))
         at_s = 1e-9 * np.where(is_image, stamps_ns - first_ns, np.maximum(stamps_ns - first_ns, 0))
         begin_s, end_s = self._span_s
@@ -335,10 +335,10 @@ class LogReader:
         for name, text in _WARNINGS.items():
             if self.counts[name]:
                 self.warnings.append(text.format(self.counts[name], fault=faults.get(name, "")))
-        self.warnings += [
+        self.warnings += [  # of a part, samples that are farther apart than it is long need not be in it
             f"no sample of {topic} is used: by its stamps it is not of the time of the images: is it of another clock?"
             for topic in sorted(self._motion - used)
-            if self._log.counts()[topic]
+            if self._log.counts()[topic] and self._span_s == WHOLE
         ]
 
     @cached_property

@@ -73,12 +73,12 @@ def _show(log: Log) -> None:
     counts = Counter(message.topic for message in log.messages())  # what cannot be read shows by that
     skipped = f"{len(log.faults)} corrupt chunks or records, which are skipped" if log.faults else ""
     state = ": ".join(filter(None, (log.state, log.cut, skipped)))
-    logged_ns, time = log.entries["time_ns"], ""
+    logged_ns, span = log.entries["time_ns"], ""
     if logged_ns.size:
         first_ns, last_ns = int(logged_ns.min()), int(logged_ns.max())
-        time = f"{utc(first_ns)} to {utc(last_ns)}, {(last_ns - first_ns) / 1e9:.3f} s"
+        span = f"{utc(first_ns)} to {utc(last_ns)}, {(last_ns - first_ns) / 1e9:.3f} s"
     listed = ", ".join(f"{name} ({len(data) / 1e3:.1f} kB)" for name, data in log.attachments().items())
-    entries = {"log": str(log.path), "size": f"{log.size_bytes / 1e6:.1f} MB", "state": state, "time": time}
+    entries = {"log": str(log.path), "size": f"{log.size_bytes / 1e6:.1f} MB", "state": state, "time": span}
     entries |= {"messages": str(counts.total()), "attachments": listed or "none"}
     options.print_entries({name: plain(text) for name, text in entries.items()})
     rows = []
@@ -86,11 +86,10 @@ def _show(log: Log) -> None:
         span_s = 1e-9 * np.ptp(logged_ns[log.topic == number]) if counts[name] > 1 else 0.0
         rate = f"{(counts[name] - 1) / span_s:.2f}" if span_s else "-"
         rows.append((plain(name), plain(kind) or "-", counts[name], rate))
-    rows.sort()
     if rows:
         wide, wide_kind = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:2])
         print(f"\n{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}")
-    for name, kind, count, rate in rows:
+    for name, kind, count, rate in sorted(rows):
         print(f"{name:<{wide}}  {kind:<{wide_kind}}{count:>10}{rate:>9}")
 
 
@@ -190,8 +189,8 @@ def _viewer() -> str:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     words = f"-m rerun_cli --bind 127.0.0.1 --port {port} --hide-welcome-screen --expect-data-soon".split()
-    # In a session of its own: Ctrl-C does not end a window.
     environment = python_environment(RUST_LOG="warn")
+    # In a session of its own: Ctrl-C does not end a window.
     subprocess.Popen(python(*words), stdin=subprocess.DEVNULL, start_new_session=True, env=environment)
     return f"rerun+http://127.0.0.1:{port}/proxy"
 
@@ -218,7 +217,7 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
             if (content := state.next(0.5)) is not None:
                 sink.draw(content)
     if not sink.poses:
-        options.failed(f"no pose of {config.bus.robot} came: `omnid listen` names those that are there")
+        options.failed(f"no pose of {config.bus.robot} came: `omnid listen` names the robots that are there")
 
 
 @options.command()

@@ -87,7 +87,7 @@ def simulate(args: argparse.Namespace) -> int:
 
     Cameras, motor controller and gyro (motion.imu=off: none) are simulated. Everything else is as in `omnid run`: then
     `omnid arm`, `omnid drive`, `omnid goto`, `omnid web`. Simulated time waits for the daemon: a busy computer slows it
-    down, and loses nothing.
+    down, and no image is lost.
 
     world WORLD               room, corridor, building, hall, office, clutter, door_80, person_passes, or a file *.toml
     --seed N=1 0..            of textures and noise
@@ -125,7 +125,7 @@ def simulate(args: argparse.Namespace) -> int:
 def replay(args: argparse.Namespace) -> int:
     """Run a recorded log through the stages of the daemon, and print a summary.
 
-    Exit code 1: no pose was found, or a tenth of the pairs is missing.
+    Exit code 1: no pose was found, more than a tenth of the pairs is missing, or records of the log are damaged.
 
     log LOG              an .mcap, .db3 or .bag file, a folder with one or with its parts, or a folder with a folder of
         stamped images for each camera

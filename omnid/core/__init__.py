@@ -5,6 +5,6 @@ centre. `stereo/` matches two panoramas, `odometry/` estimates the motion of the
 `mapping/` and `obstacles/` say what is around, `navigation/` plans ways, `control/` decides what the wheels do, `rig/`
 asks whether the calibration still holds. `floor.py` is the one floor of a run, `frames.py` the frames of poses and
 covariances, `types/` the images that all share. Time comes as `stamp_ns` arguments; errors are values or exceptions,
-never log lines. Loops over pixels are compiled by numba (`compiled.py`) and stand in files `*_kernels.py` beside the
+never log lines. Loops over pixels are compiled by numba (`compiled.py`) and are in files `*_kernels.py` next to the
 code that calls them.
 """

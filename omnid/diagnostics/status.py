@@ -272,10 +272,8 @@ class StatusCollector:
     def _camera(self, name: Camera) -> Stats:
         state, age_s = self._cameras[name], self._age_s(self._pair.newest_ns[name])
         counts = ("frames", Key.DROPS, Key.ERRORS, "restamped", Key.RESTARTS, Key.LOSSES, "reopens")
-        error = ""
-        if state.status == "lost":
-            error = state.problem or "lost"
-        elif state.status == "streaming" and not age_s <= TIMEOUT_S:
+        error = (state.problem or "lost") if state.status == "lost" else ""
+        if state.status == "streaming" and not age_s <= TIMEOUT_S:
             error = "no new image"
         return {
             "mode": state.mode,

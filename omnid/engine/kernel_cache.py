@@ -39,5 +39,4 @@ def prepare_kernels() -> None:
     except Exception as error:  # Pickle and LLVM raise any error for damaged files.
         for name in modules:
             shutil.rmtree(code_folder(name), ignore_errors=True)
-        text = f"what was compiled earlier is damaged ({error}); it is deleted now: start again"
-        raise OmnidError(text) from error
+        raise OmnidError(f"what was compiled earlier is damaged ({error}); it is deleted now: start again") from error

@@ -58,8 +58,8 @@ def judge(stamps_s: Array, T: Array, distance_m: float) -> int:
     xyz = T[:, :-1, -1]
     marks = visits(xyz, rests(stamps_s, T), distance_m)
     if len(marks) < 3:
-        found = f"on B {distance_m:g} m away, and on A; found {len(marks)}"
-        raise OmnidError(f"expected rests of {STAND_S:g} s on A, {found}")
+        found = len(marks)
+        raise OmnidError(f"expected rests of {STAND_S:g} s on A, on B {distance_m:g} m away, and on A; found {found}")
     legs_m = np.array([math.dist(xyz[a], xyz[b]) for a, b in pairwise(marks)])
     for leg, length_m in enumerate(legs_m):
         print(f"{'AB'[leg % 2]} to {'BA'[leg % 2]} {length_m:.4f} m, {length_m / distance_m - 1:+.2%}")
@@ -77,7 +77,10 @@ def main(arguments: list[str]) -> int:
     """Judge the log or trajectory that the arguments name."""
     if len(arguments) not in (2, 3):
         raise OmnidError("expected LOG DISTANCE_M [RIG.toml], as the first lines of this file say")
-    log, distance_m, *rig = arguments
+    log, distance, *rig = arguments
+    distance_m = float(distance)
+    if not 0 < distance_m < math.inf:
+        raise OmnidError(f"DISTANCE_M {distance}: expected the distance of the marks, above 0")
     if Path(log).suffix in (".txt", ".tum"):
         path = read_tum(Path(log))
         stamps_ns, T_odom_rig = path.stamps_ns, path.T
@@ -85,7 +88,7 @@ def main(arguments: list[str]) -> int:
         run = omnid.replay(log, rig=rig[0] if rig else None)
         stamps_ns, T_odom_rig = run.stamps_ns, run.T_odom_rig
     T_rig_base = se3.inverse(read_rig(Path(rig[0])).T_base_rig) if rig else np.eye(4)
-    return judge(1e-9 * (stamps_ns - stamps_ns[0]), T_odom_rig @ T_rig_base, float(distance_m))
+    return judge(1e-9 * (stamps_ns - stamps_ns[0]), T_odom_rig @ T_rig_base, distance_m)
 
 
 if __name__ == "__main__":

@@ -32,8 +32,8 @@ def rates_radps(received: bytearray) -> Iterator[tuple[float, float, float]]:
     """Remove the packets from the bytes; yield the angular velocities about x, y, z of the valid ones [rad/s]."""
     while len(received) >= PACKET.size:
         packet = bytes(received[: PACKET.size])
-        start, kind, x, y, z, _, total = PACKET.unpack(packet)
-        if start != 0x55 or sum(packet[:-1]) & 0xFF != total:
+        _, kind, x, y, z, _, total = PACKET.unpack(packet)
+        if packet[:1] != b"\x55" or sum(packet[:-1]) & 0xFF != total:
             del received[:1]  # this byte was not the start of a packet
             continue
         del received[: PACKET.size]

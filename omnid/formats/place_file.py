@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
+from drivers.errors import one_line
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.places.features import COLUMNS, DESCRIPTOR, ROWS
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
@@ -73,10 +74,9 @@ def read_places(path: str | Path) -> tuple[PlaceMap, PlaceRig]:
     except OSError as error:
         raise OmnidError(f"{path}: cannot read the map: {error.strerror or error}") from error
     except Exception as error:  # whatever zipfile and numpy raise for bytes that no omnid has written
-        found = " ".join(str(error).split()) or type(error).__name__
         raise OmnidError(
-            f"{path}: expected a map of places of version {FORMAT}, found another file or a damaged one: {found}; "
-            "`omnid map build` makes one"
+            f"{path}: expected a map of places of version {FORMAT}, found another file or a damaged one: "
+            f"{one_line(error)}; `omnid map build` makes one"
         ) from error
 
 

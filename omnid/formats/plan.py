@@ -134,5 +134,5 @@ def image_of(axes: Axes) -> Image:
 
 
 def shares_of(axes: Axes, xy_m: Array) -> Array:
-    """Return the places (N, 2) of points (N, 2) [m] in the image, in shares of its width and, from above, height."""
+    """Return the places (N, 2) of points (N, 2) [m] in the image, as fractions of its width and, from above, height."""
     return np.asarray(axes.transData.transform(xy_m) / axes.figure.bbox.size * (1, -1) + (0, 1))

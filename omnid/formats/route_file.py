@@ -80,8 +80,7 @@ def parse_route(content: bytes, name: str) -> Route:
         points = numbers[:, :3], numbers[:, 3], keyframes, numbers[:, 5:]
         return Route(route_name(found.name), *points, dict(found.keyframes), found.created_s, found.map)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OmnidError) as error:
-        what = "this is no route of version 1, or a damaged one"
-        raise OmnidError(f"{name}: {what}: {error}: teach it again") from None
+        raise OmnidError(f"{name}: this is no route of version 1, or a damaged one: {error}: teach it again") from None
 
 
 class RouteFolder:

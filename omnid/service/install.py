@@ -45,8 +45,8 @@ def files_to_write(program: Path, *, page: bool = False, root: Path = Path("/"))
     texts = {f"etc/systemd/system/{unit}": service_file(unit).replace(SHIPPED_PROGRAM, str(program)) for unit in units}
     wanted = {root / name: text for name, text in texts.items()}
     found = {path: text for path, text in wanted.items() if not path.exists() or path.read_text() != text}
-    kept = {"udev/rules.d/90-omnid.rules": service_file("90-omnid.rules")}
-    kept["omnid/omnid.toml"] = dump(Config(), FIRST_SETTINGS)
+    rules = service_file("90-omnid.rules")
+    kept = {"udev/rules.d/90-omnid.rules": rules, "omnid/omnid.toml": dump(Config(), FIRST_SETTINGS)}
     return found | {root / "etc" / name: text for name, text in kept.items() if not (root / "etc" / name).exists()}
 
 

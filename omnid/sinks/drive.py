@@ -64,8 +64,7 @@ def navigation_answers(update: NavigationUpdate) -> Answers | None:
     refusal, state = update.answer.refusal, update.state
     is_idle = state.is_end and state is not NavigationState.CANCELLED
     words = "no drive is under way" if is_idle else f"navigation: {with_reason(state, update.reason)}"
-    text = refusal or f"accepted; {words}"
-    return {update.answer.id: Answer(not refusal, text)}
+    return {update.answer.id: Answer(not refusal, refusal or f"accepted; {words}")}
 
 
 def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -> ControllerPose:

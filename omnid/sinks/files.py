@@ -34,7 +34,7 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
         elif (other := used.setdefault(_identity(path), option)) != option:
             wrong = f"this is {other} as well"
         elif not os.access(path if path.exists() else path.parent, os.W_OK):
-            wrong = "it may not be written"
+            wrong = "there is no permission to write it"
         if wrong:
             raise OmnidError(f"{option} {path}: {wrong}; name another file")
 

@@ -75,5 +75,4 @@ def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
     rows = frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # the colour planes follow as rows
     step = frame.step or len(data) // rows
     name = _ROS_NAMES.get(frame.encoding, frame.encoding)
-    data = data[: step * rows]
-    return IMAGE, encoded(IMAGE, head, frame.height, frame.width, name, int(frame.bigendian), step, data)
+    return IMAGE, encoded(IMAGE, head, frame.height, frame.width, name, int(frame.bigendian), step, data[: step * rows])

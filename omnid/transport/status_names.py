@@ -162,7 +162,7 @@ class NavigationReport:
 
     stamp_ns: int = 0
     state: str = ""
-    reason: str = ""  # of a halt or an end
+    reason: str = ""  # of a stop or an end
     task: str = ""  # "goal", "path" or "route NAME"
     command_ns: int = 0  # stamp of the goal or path that it follows from; 0 without
     left_m: float = math.nan  # way to the end; NaN unknown

@@ -89,7 +89,8 @@ class StopSender:
             for sender in self._sockets:
                 with suppress(OSError):  # there is no more, or no program listens there
                     for _ in range(MAX_PER_PASS):
-                        answer = self._answers.get(sender.recv(len(self._request)), answer)
+                        if answer != STOPPED:  # an older answer may come later, by another way
+                            answer = self._answers.get(sender.recv(len(self._request)), answer)
             if time.monotonic() >= deadline_s:
                 break
         return answer

@@ -1,8 +1,8 @@
 """A run drawn in Rerun: a replay as it computes, a recording, or a live robot by its messages; time is the stamp.
 
-Entities: odom (the world) with path, map, and base_link with obstacles and the points of
-the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma;
-state; log. Colours are those of Okabe and Ito, which colour-blind people can distinguish.
+Entities: odom (the world) with path, map, and base_link with obstacles and the points of the newest images; panorama
+with its features; depth; plots of speed, yaw_rate, landmarks, sigma; state; log. Colours are those of Okabe and Ito,
+which colour-blind people can distinguish.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ TIMELINE: Final = "stamp"
 # Messages of a kind that are drawn in full; after each further such number every 2nd, 4th, 8th ... is drawn.
 MAX_DENSE: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50}
 MAP_POINTS, RIG_POINTS = 50_000, 3_000
-# Colours, and sizes on the screen: the radii of lines and points, which do not depend on the distance [px]; of the path
-# by the state: the worse, the thicker.
+# Colours, and radii of lines and points on the screen [px], whatever their distance. The worse the state of a pose is,
+# the thicker is its piece of the path.
 BLUE, GREEN, ORANGE, RED = "#56b4e9", "#009e73", "#e69f00", "#d55e00"
 GREY = "#969696"
 THIN, MEDIUM, THICK = 1.5, 2.5, 5.0

@@ -210,6 +210,7 @@ def serve(
             access_log=False,
             proxy_headers=False,
             server_header=False,
+            ws="none",  # else uvicorn would pass websockets on, or advise a library for them
             timeout_graceful_shutdown=1,
         )
         # 3. Print where it is; with the tokens, unless the journal would keep them.

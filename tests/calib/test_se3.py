@@ -21,14 +21,14 @@ def test_exp_equals_opencv_rodrigues_and_log_inverts_it(angle: float) -> None:
 
 
 @pytest.mark.parametrize("axis", [*np.eye(3), AXIS, [0.6, 0.8, 0], [1e-9, 0.6, -0.8]])
-def test_log_of_a_rotation_by_pi(axis: list[float]) -> None:
+def test_the_log_of_a_rotation_by_pi_has_its_axis_and_angle(axis: list[float]) -> None:
     R = 2 * np.outer(axis, axis) - np.eye(3)
     w = se3.rotation_log(R)
     assert np.linalg.norm(w) == pytest.approx(np.pi, abs=1e-12)
     assert abs(w @ axis) == pytest.approx(np.pi, abs=1e-8)
 
 
-def test_quaternion_order_and_sign() -> None:
+def test_quaternions_are_x_y_z_w_with_w_above_zero() -> None:
     quarter_left = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     np.testing.assert_allclose(se3.quaternion(quarter_left), [0, 0, np.sqrt(0.5), np.sqrt(0.5)], rtol=0, atol=1e-15)
     q = np.random.default_rng(0).normal(size=(500, 4))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
+import contextlib
+import io
 import json
 import re
+import shlex
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -51,24 +53,22 @@ def anchors(path: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
-def commands() -> Iterator[tuple[str, list[str]]]:
-    """Yield the document and the words, after `omnid`, of each command in blocks of code."""
+def commands(*, in_blocks: bool) -> Iterator[tuple[str, str]]:
+    """Yield the document and the words, after `omnid`, of each command in blocks of code, or between the others."""
     for path in documents():
         for line, is_code in prose_and_code(path.read_text("utf-8")):
-            if is_code:
-                for found in re.findall(r"(?:^|bin/|sudo |&& )omnid ([a-z][^&#]*)", line.strip()):
-                    yield path.name, found.split()
+            if is_code == in_blocks and (is_code or path.name not in OF_THE_PAST):
+                for text in [line.strip()] if is_code else re.findall("`([^`]*)`", line):
+                    for found in re.findall(r"(?:^|bin/|sudo |&& )omnid ([a-z][^&#|]*)", text):
+                        yield path.name, found
 
 
-def unknown_words(words: list[str]) -> list[str]:
-    """Return the command, if there is no such one, or its options that do not exist."""
-    name = next((name for name in (" ".join(words[:2]), words[0]) if name in cli.COMMANDS), None)
-    if name is None:
-        return words[:1]
-    known = argparse.ArgumentParser()
-    cli.command_at(cli.COMMANDS[name][0]).add_to(known)
-    options = {option for action in known._actions for option in action.option_strings}
-    return [word for word in words if re.fullmatch("--[a-z-]+", word) and word not in options]
+def complaint(command: str) -> str:
+    """Return what the command line reports about words that it does not accept; empty if it accepts all."""
+    words = shlex.split(re.sub(r"\[(-[^]]*)\]", r"\1", command.replace("...", "")))
+    with contextlib.redirect_stderr(io.StringIO()) as reported, contextlib.suppress(SystemExit):
+        cli.parser_of(words).parse_args(words)
+    return reported.getvalue()
 
 
 @pytest.mark.parametrize("path", documents(), ids=lambda path: path.relative_to(ROOT).as_posix())
@@ -95,10 +95,37 @@ def test_files_that_documents_name_exist() -> None:
     assert [entry for entry in named if not any(file.endswith(f"/{entry[1]}") for file in files)] == []
 
 
-def test_commands_in_documents_and_their_options_exist() -> None:
-    found = list(commands())
+def test_commands_in_documents_are_accepted() -> None:
+    found = list(commands(in_blocks=True))
     assert len(found) > 50
-    assert [(document, wrong) for document, words in found if (wrong := unknown_words(words))] == []
+    assert [(document, wrong) for document, words in found if (wrong := complaint(words))] == []
+
+
+def test_commands_in_the_text_lack_no_more_than_their_arguments() -> None:
+    """A text names commands without their arguments, or with words such as X in place of numbers."""
+    found = list(commands(in_blocks=False))
+    lacks = re.compile(r"are required: |expected one argument|found '[A-Z]+'")
+    assert len(found) > 80
+    assert [
+        (document, wrong) for document, words in found if (wrong := complaint(words)) and not lacks.search(wrong)
+    ] == []
+
+
+def test_programs_in_documents_exist_with_their_options() -> None:
+    found = 0
+    for path in documents():
+        for name, words in re.findall(
+            r"python -m ((?:tests|omnid)(?:\.[a-z_]+)+)\b(?!\.)([^`#\n]*)", path.read_text("utf-8")
+        ):
+            program = ROOT.joinpath(*name.split("."))
+            assert program.with_suffix(".py").exists() or (program / "__main__.py").exists(), (path.name, name)
+            # An option is a parameter, of the program or of what benchmarks share.
+            text = "".join(
+                file.read_text("utf-8") for place in (program, program.parent) for file in place.glob("*.py")
+            )
+            assert all(option in text for option in re.findall("--([a-z]+)", words)), (path.name, name, words)
+            found += 1
+    assert found > 10
 
 
 def test_each_page_is_in_the_navigation_once() -> None:

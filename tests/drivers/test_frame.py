@@ -68,7 +68,7 @@ def test_bayer_patterns_are_interpolated(name: str, dtype: str, bits: int) -> No
 
 @pytest.mark.parametrize("encoding", RAW)
 @pytest.mark.parametrize("padding", [0, 6])
-def test_raw_images_with_and_without_padding_of_rows(encoding: str, padding: int) -> None:
+def test_raw_images_are_decoded_with_and_without_padding_of_rows(encoding: str, padding: int) -> None:
     channels, expected = RAW[encoding]
     pixels = np.ascontiguousarray(COLOURS[..., :channels])
     data, step = padded_rows(pixels, padding)

@@ -169,7 +169,7 @@ def test_wrong_images_and_stamps_are_refused_and_change_nothing(scene: Path, pai
 
 
 def test_an_image_that_repeats_an_earlier_one_is_refused_and_changes_nothing(scene: Path, pairs: list[Pair]) -> None:
-    """A replay drops it: of a camera that is frozen the pose would stand still with a sigma of a millimetre."""
+    """A replay drops it: of a frozen camera the pose would not move, with a sigma of a millimetre."""
     odometry, whole, used = (
         omnid.Odometry(scene / "rig.toml", overrides=[f'pair.repeated_images="{policy}"'])
         for policy in ("drop", "drop", "use")

@@ -45,11 +45,6 @@ def test_a_rig_of_lenses_gives_poses(tmp_path: Path) -> None:
     assert found.pairs == PAIRS and found.ate_rmse_m < 0.003 and abs(found.length_error_ratio) < 0.01
 
 
-@pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    return Command(capsys)
-
-
 @pytest.fixture(scope="module")
 def sector(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a log of two pinhole cameras that see 90 degrees behind the robot, 0.6 m above the floor."""
@@ -64,26 +59,26 @@ def sector(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_sector_gives_poses(sector: Path, command: Command) -> None:
+def test_a_sector_gives_poses(sector: Path, omnid: Command) -> None:
     """A pair that looks back across azimuth 180: the command line replays and evaluates it."""
-    done = command("replay", sector / "log.mcap", "--rig", sector / "rig.toml", "--quiet", "--tum", sector / "out.txt")
+    done = omnid("replay", sector / "log.mcap", "--rig", sector / "rig.toml", "--quiet", "--tum", sector / "out.txt")
     assert done.code == 0 and "tracking 100.0%" in done.out and "rim" not in done.err + done.out, done
-    shown = command("eval", sector / "out.txt", sector / "truth.txt", "--json")
+    shown = omnid("eval", sector / "out.txt", sector / "truth.txt", "--json")
     found = json.loads(shown.out)
     assert abs(found["length_error_ratio"]) < 0.002 and found["ate_rmse_m"] < 0.004, found
 
 
-def test_beside_a_sector_nothing_is_free(sector: Path) -> None:
+def test_nothing_is_free_outside_of_a_sector(sector: Path) -> None:
     """Obstacles and scans know nothing of directions that the cameras do not see, from the first pair to the last."""
     found = scans_of(sector)
     assert len(found) > 10
     azimuths = np.rad2deg(np.pi * (2 * np.arange(360) + 1) / 360 - np.pi)
-    aside = np.abs((azimuths + 173 + 180) % 360 - 180)
-    beside, ahead = aside > 45 + 15, aside < 45 - 15
+    off_axis_deg = np.abs((azimuths + 173 + 180) % 360 - 180)
+    outside, inside = off_axis_deg > 45 + 15, off_axis_deg < 45 - 15
     for scan in found:
-        assert np.isnan(scan.ranges_m[beside]).all()
-        assert (scan.free_m[beside] <= FOOTPRINT_M).all(), np.nanmax(scan.free_m[beside])
-    assert (found[2].free_m[ahead] > 0.8).mean() > 0.5  # later it has left floor behind that it never saw
+        assert np.isnan(scan.ranges_m[outside]).all()
+        assert (scan.free_m[outside] <= FOOTPRINT_M).all(), np.nanmax(scan.free_m[outside])
+    assert (found[2].free_m[inside] > 0.8).mean() > 0.5  # later the robot stands on floor that it never saw
 
 
 FEW, START_NS, PERIOD_NS, BASELINE_M, SEED = 8, 1_706_000_000 * 10**9, 100_000_000, 0.191, 2

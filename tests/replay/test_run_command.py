@@ -42,7 +42,7 @@ def test_the_run_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path:
         count = len(operator.poses)
         wait_until(lambda: len(operator.poses) > count + 5, "more poses")
         assert not base.line.moved_since(stopped_s), "no new command"
-        wait_until(lambda: operator.message("wheels") == "no command", "the word that no command comes")
+        wait_until(lambda: operator.message("wheels") == "no command", "the status without a command")
         operator.drive(0.3)
         wait_until(lambda: base.drives, "motion again")
         operator.send("cmd/stop", b"")
@@ -78,7 +78,7 @@ def test_the_run_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Pat
 
 
 def expect_a_status_of_every_part(operator: Operator) -> None:
-    wait_until(lambda: operator.message("recording") == "recording", "the recording's word")
+    wait_until(lambda: operator.message("recording") == "recording", "the status of the recording")
     assert operator.message("bus") == "open"
     wait_until(lambda: operator.values("rig").get("state") in list(RigState), "the state of the rig")
 
@@ -102,7 +102,7 @@ def test_a_camera_fails_and_recovers(tmp_path: Path, course: Path) -> None:
         operator.drive()
         wait_until(lambda: base.drives, "motion")
         daemon.write_line("upper mute")
-        wait_until(lambda: operator.message("pairing") == "no images of the upper camera", "the word which is gone")
+        wait_until(lambda: operator.message("pairing") == "no images of the upper camera", "the missing camera")
         wait_until(lambda: operator.message("odometry") == "no new pose", "stale odometry")
         wait_until(lambda: not base.drives, "the stop")
         assert operator.message("upper camera") == "no new image"
@@ -123,7 +123,7 @@ def test_the_run_uses_the_attached_rig_and_ends_with_the_log() -> None:
 
 
 def test_a_signal_ends_the_run_without_output_at_any_time(scene: Path) -> None:
-    """Also while it starts."""
+    """Also while the run starts."""
     port = free_port()
     words = ("--motor", "simulated", "--set", "obstacles.scan.floor_m=-1.2")
     with started(command_line(scene, port, None, *words), port) as daemon:

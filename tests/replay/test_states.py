@@ -47,7 +47,9 @@ def errors_m(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     return np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
 
 
-def test_a_camera_without_images_for_a_second(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_camera_without_images_for_a_second_leaves_one_degraded_pose(
+    omnid: Command, tmp_path: Path, scene: Path
+) -> None:
     taken = [p for p in images(scene / "log.mcap") if p.camera == "lower" or not 7 <= p.pair < 17]
     log = save(tmp_path / "log.mcap", taken)
     result = omnid.replay(log, "--record", tmp_path / "out.mcap", "--tum", tmp_path / "est", rig=scene / "rig.toml")
@@ -77,10 +79,10 @@ def test_a_pose_lost_in_two_seconds_of_darkness_is_found_again(omnid: Command, t
 
 
 @pytest.mark.parametrize("cameras", [("lower", "upper"), ("upper",)])
-def test_images_without_texture_at_the_start(
+def test_poses_are_lost_while_images_have_no_texture_and_tracked_after_it(
     omnid: Command, tmp_path: Path, scene: Path, cameras: tuple[str, ...]
 ) -> None:
-    """They differ by a grey level, so that no camera counts as frozen."""
+    """The blank images differ by grey levels, so that no camera counts as frozen."""
 
     def blank(image: Image) -> Image:
         grey = np.full(read_rig(scene / "rig.toml").lower.camera.size[::-1], 8 * image.pair, np.uint8)
@@ -94,7 +96,9 @@ def test_images_without_texture_at_the_start(
     assert found[0] == "lost" and found[-1] == "tracking"
 
 
-def test_another_scene_after_the_dark(omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path) -> None:
+def test_odometry_begins_again_in_another_scene_after_the_dark(
+    omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path
+) -> None:
     before, after = images(scene / "log.mcap"), images(elsewhere / "log.mcap")
     dark_images = [dark(p.later(1 + k)) for k in range(DARK_PAIRS) for p in before[:2]]
     log = save(tmp_path / "log.mcap", [*before[:2], *dark_images, *(p.later(1 + DARK_PAIRS) for p in after)])
@@ -104,7 +108,7 @@ def test_another_scene_after_the_dark(omnid: Command, tmp_path: Path, scene: Pat
     assert sigmas_m(tmp_path / "out.mcap")[-1] > 0.5  # the gap stays in the covariance
 
 
-def test_cameras_that_are_exchanged_on_the_way(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_exchanged_cameras_end_tracking_and_are_named(omnid: Command, tmp_path: Path, scene: Path) -> None:
     """The lower camera alone tracks on, 0.2 m too high, and stereo of exchanged images finds points by chance."""
     other = {"lower": "upper", "upper": "lower"}
     taken = [p if p.pair < 6 else replace(p, camera=other[p.camera]) for p in images(scene / "log.mcap")]
@@ -116,7 +120,7 @@ def test_cameras_that_are_exchanged_on_the_way(omnid: Command, tmp_path: Path, s
     assert "tracking" not in dict(found[1:])
 
 
-# Images that are whole, but torn, displaced, or with lines twice or missing: no pose of them is sure, a line says so
+# Images that are torn, displaced, or have lines twice or missing: a warning names them, and no pose is sure
 
 
 Edit = Callable[[Sequence[Pixels]], list[Pixels]]
@@ -126,7 +130,7 @@ LEAST_M: Final = 0.005  # of an error beside which a pose may be called sure
 
 
 class Case(NamedTuple):
-    """Images of which cameras are edited, a pattern of the line that says it, and the pair from which on they are."""
+    """The cameras whose images are edited, how, from which pair on, and a pattern of the warning that names it."""
 
     cameras: tuple[Literal["lower", "upper"], ...]
     edit: Edit
@@ -181,9 +185,9 @@ def edited(log: Path, case: Case) -> Path:
 def test_a_broken_image_is_named_and_no_pose_of_it_is_sure(course: Path, tmp_path: Path, name: str) -> None:
     case = CASES[name]
     result = replay(edited(course / "log.mcap", case), course / "rig.toml", overrides=["places.enabled=false"])
-    told = [line for line in result.warnings if line.startswith("images of the ")]
-    assert any(re.search(case.line, line) for line in told), result.warnings
-    assert len(told) <= 4
+    warned = [line for line in result.warnings if line.startswith("images of the ")]
+    assert any(re.search(case.line, line) for line in warned), result.warnings
+    assert len(warned) <= 4
     truth = read_tum(course / "truth.txt")
     T_true = truth.T[len(truth.T) - len(result.T_odom_rig) :]
     T_true = se3.inverse(T_true[0]) @ T_true

@@ -115,10 +115,13 @@ def test_sensors_with_another_clock_than_the_images_are_named(
         late = replace(sample, stamp_ns=sample.stamp_ns + shift_s * 10**9)
         return entry(sample)._replace(data=entry(late).data)
 
-    reader = LogReader(saved(tmp_path / "log.mcap", scene, [*map(shifted, samples)]), motion=MotionTopics())
+    log = saved(tmp_path / "log.mcap", scene, [*map(shifted, samples)])
+    reader = LogReader(log, motion=MotionTopics())
     assert len(list(reader.frames())) == 2 * PAIRS
     (line,) = reader.warnings
     assert f"no sample of {GYRO} is used" in line and "another clock" in line
+    part = LogReader(log, span_s=(0.0, 0.001), motion=MotionTopics())
+    assert len(list(part.frames())) == 2 and part.warnings == [], "so short a part holds no samples anyway"
 
 
 def test_a_pose_that_the_wheels_contradict_is_degraded_and_its_sigma_covers_theirs(

@@ -136,7 +136,7 @@ class ObstacleGrid:
         return np.append(pose[:2] + np.array([[c, -s], [s, c]]) @ self._eye_base, pose[2])
 
     def set_floor(self, T_rect_base: Array) -> None:
-        """Take T_rect_base (4, 4), from the base level on the floor to the columns."""
+        """Set the floor by T_rect_base (4, 4), from the base level on the floor to the columns."""
         self._eye_base = se3.inverse(T_rect_base)[:2, 3]
         self._turn_rad = math.atan2(T_rect_base[1, 0], T_rect_base[0, 0])
 
@@ -316,9 +316,9 @@ class ObstacleGrid:
         return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32), is_nearer)
 
     def _assume_free(self, columns: Floats, hides: Flags, belief: RayBelief) -> None:
-        """Take the floor too near to be seen for free at the start, but where something hides the nearest in view.
+        """Assume at the start that floor too near to be seen is free, except where something hides the nearest in view.
 
-        That may stand anywhere before the floor that it hides. Nothing is assumed where no floor is in view, in wider
+        That may be anywhere before the floor that it hides. Nothing is assumed where no floor is in view, in wider
         directions than a strut or a mast hides. columns (SIDE, SIDE): directions of cells; hides (D,).
         """
         p, count = self._p, len(hides)
@@ -332,7 +332,7 @@ class ObstacleGrid:
         self.odds[free & (self.odds < 0)] = p.least
 
     def _assume_walls(self, yaw_rad: float, hides: Flags, belief: RayBelief) -> None:
-        """Take what hides the nearest floor in view at the start for a wall, where a straight one goes on at both ends.
+        """Assume walls: what hides the nearest floor in view at the start, where a straight wall goes on at both ends.
 
         So a base may begin between walls that are nearer than the floor in view. Beside what stands alone the floor
         goes on, and what ends it there is too far away to hide any. hides (D,).

@@ -93,9 +93,9 @@ def ramp_ahead(pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: f
     viewpoint: x, y, heading in odom; turn_rad: of odom in the rectified frame; climbed: slope of the base in odom.
     """
     # 1. Gains of all ramps in parts of the way.
-    aside = np.angle(np.exp(1j * (AZIMUTHS - viewpoint[2] - turn_rad)))
-    order = np.argsort(aside)
-    ahead = order[np.abs(aside[order]) < HALF_RAD]
+    offset_rad = np.angle(np.exp(1j * (AZIMUTHS - viewpoint[2] - turn_rad)))
+    order = np.argsort(offset_rad)
+    ahead = order[np.abs(offset_rad[order]) < HALF_RAD]
     parts = ahead[: len(ahead) // PARTS * PARTS].reshape(PARTS, -1)[:, ::2].astype(np.int32)
     slopes = np.concatenate([np.arange(GENTLEST, STEEPEST + STEP / 2, STEP), TOO_STEEP])
     if climbed > GENTLEST:  # A landing is level.
@@ -103,7 +103,7 @@ def ramp_ahead(pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: f
     gains = np.empty((PARTS, len(STARTS_M), len(slopes)))
     upright = np.empty((PARTS, math.ceil(view.at_1m / STARTS_M[0]), view.height))
     live, height_m = pair.seen * np.uint8(255), view.plane.height_m
-    images = *pair.bounded, live, view.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
+    images = *pair.bounded, live, view.plane_rows, np.ascontiguousarray(parts), np.cos(offset_rad)
     geometry = view.row0, FOCAL_PX, height_m, view.at_1m / FOCAL_PX, SEEN_M
     ramp_gains(*images, *geometry, STARTS_M, slopes, gains, upright)
     by_gain = 2 * RATIO / UNITS * PARTS  # nats. Every second direction was looked at.
@@ -143,7 +143,7 @@ class RayScans:
         self._way = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
 
     def set_floor(self, T_rect_base: Array, visible: Flags) -> None:
-        """Take T_rect_base (4, 4), from the base level on the floor to the panoramas, and their pixels (H, W)."""
+        """Set the floor by T_rect_base (4, 4), from the base level on it to the panoramas, and their pixels (H, W)."""
         self._T_rect_base, self._visible = T_rect_base, visible
         self._T_odom_floor = np.eye(4)  # pose of the base when it stood on the floor before a ramp
         self.grid.set_floor(T_rect_base)

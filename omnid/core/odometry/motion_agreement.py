@@ -91,7 +91,7 @@ class MotionAgreement:
 
     def __init__(self, motion: MotionFilter) -> None:
         """motion: the filter, with the samples of wheels and gyro."""
-        # Starts and ends [s] of steps of the base, distance ahead [m], turn [rad], distance aside [m] by the cameras.
+        # Starts and ends [s] of steps of the base, distance ahead [m], turn [rad], lateral distance [m] by the cameras.
         self._steps: deque[tuple[float, float, float, float, float]] = deque(maxlen=MAX_MOTIONS)
         self._motion = motion
         self._compared_s = -math.inf
@@ -121,7 +121,7 @@ class MotionAgreement:
         while self._steps and self._steps[0][1] < time_s:
             self._steps.popleft()
 
-    def _compare(self, starts: Array, ends: Array, ways: Array, turns: Array, aside: Array) -> Conflict:
+    def _compare(self, starts: Array, ends: Array, ways: Array, turns: Array, lateral: Array) -> Conflict:
         """Return the sensor that differs, and whether it is a fault, by steps (N,) of the cameras."""
         # 1. Each sensor against the images; for the wheels the worse one of distance and turn counts.
         lagged = starts - LAGS_S[:, None], ends - LAGS_S[:, None]
@@ -135,7 +135,7 @@ class MotionAgreement:
         # 2. Which one differs from the others.
         if not wheels.differs and not of_gyro.differs:
             self._late_since_s = None
-            to_side = _aside(spans, turns, aside) if distance.is_known else _Finding()
+            to_side = _sideways(spans, turns, lateral) if distance.is_known else _Finding()
             return Conflict(IMAGES_ASIDE, to_side.text, to_side.excess >= 1.0) if to_side.differs else AGREE
         if wheels.differs and of_gyro.differs:
             reason, found = IMAGES_DIFFER, max(wheels, of_gyro, key=lambda found: found.excess)
@@ -224,15 +224,15 @@ def _lag(by_lag: Array, seen: Array) -> tuple[int, int, bool]:
     return best, near, bool(is_strong and best not in allowed)
 
 
-def _aside(spans: tuple[Array, Array, Array], turns: Array, aside: Array) -> _Finding:
+def _sideways(spans: tuple[Array, Array, Array], turns: Array, lateral: Array) -> _Finding:
     """Return the motion to the side (N,) in the straight part of the newest WINDOW_M."""
     starts, ends, ways = spans
-    straight = np.flatnonzero((np.abs(turns) <= STRAIGHT_RADPM * np.abs(ways)) & (np.abs(aside) < np.abs(ways)))[::-1]
+    straight = np.flatnonzero((np.abs(turns) <= STRAIGHT_RADPM * np.abs(ways)) & (np.abs(lateral) < np.abs(ways)))[::-1]
     path_m = np.cumsum(np.abs(ways[straight]))
     count = min(len(path_m), int(np.searchsorted(path_m, WINDOW_M)) + 1)
     if count < LEAST_STEPS:
         return _Finding()
-    moved_m, length_m = abs(float((aside * np.sign(ways))[straight][:count].sum())), float(path_m[count - 1])
+    moved_m, length_m = abs(float((lateral * np.sign(ways))[straight][:count].sum())), float(path_m[count - 1])
     is_whole = count < len(path_m) or _is_long(starts, ends)
     limit_m = max(ASIDE_SHARE * (length_m if is_whole else WINDOW_M), LEAST_M)
     return _Finding(True, moved_m / limit_m, f"by {math.degrees(math.atan2(moved_m, length_m)):.0f} degrees")

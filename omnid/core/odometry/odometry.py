@@ -264,7 +264,7 @@ class VisualOdometry:
 
     def _accept(self, now: _Prediction, estimate: PoseEstimate, *, is_reset: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""
-        # 1. Whether many landmarks support the pose, or nearly all of few all around: they are no single moving thing.
+        # 1. Whether many landmarks support the pose, or nearly all of few all around: they are no single moving object.
         limits, at_previous = self._limits, None
         is_after_gap = self._refused_s is not None or now.dt_s > self._limits.max_gap_s
         parts = np.unique(np.floor(estimate.pixels[:, 0] * (AROUND / self._model.cylinder.period_px)) % AROUND)

@@ -103,10 +103,10 @@ def plane_maps(
     rays -= t[:, None, None]
     x, y = (points[:, :2] / r[:, None]).T[:, :, None]
     axes = R[:, :, 0] * x + R[:, :, 1] * y, R[:, :, 1] * x - R[:, :, 0] * y, R[:, :, 2]
-    ahead, aside, high = (np.einsum("nijk,nk->nij", rays, axis) for axis in axes)
+    ahead, left, high = (np.einsum("nijk,nk->nij", rays, axis) for axis in axes)
     nodes = np.empty((len(points), 2, 3, 3))
-    nodes[:, 0] = -focal_px * np.arctan2(aside, ahead)
-    nodes[:, 1] = focal_px * ((points[:, 2] / r)[:, None, None] - high / np.hypot(ahead, aside))
+    nodes[:, 0] = -focal_px * np.arctan2(left, ahead)
+    nodes[:, 1] = focal_px * ((points[:, 2] / r)[:, None, None] - high / np.hypot(ahead, left))
     is_bent = (along > 0) & (ahead > 0) & (np.abs(nodes) < 4 * half + 2).all(axis=1)
     is_flat = ~(is_bent.all(axis=(1, 2)) & (scale > 0))
     nodes[is_flat, 0], nodes[is_flat, 1] = offsets[is_flat, 0][:, None], offsets[is_flat, 1][:, :, None]

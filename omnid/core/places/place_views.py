@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def paths_xy(places: PlaceMap, rig: PlaceRig) -> Array:
-    """Return the paths (N, 2) [m] of all drives, a row of NaN after each; one ends with its session or the odometry."""
+    """Return the paths (N, 2) [m] of all drives, a row of NaN after each; a reset of odometry begins another drive."""
     rows = [np.zeros((0, 2))]
     session = {id: keyframe.session for id, keyframe in places.keyframes.items()}
     by_odometry = [(link.a, link.b) for link in places.links if not link.is_loop and session[link.a] == session[link.b]]
@@ -48,7 +48,7 @@ def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
 
 
 def landmarks(places: PlaceMap, rig: PlaceRig, voxel_m: float) -> MapPoints:
-    """Return the landmarks of all keyframes up to MAX_RANGE_M, fused in voxels."""
+    """Return the landmarks of all keyframes up to MAX_RANGE_M, fused in voxels of voxel_m [m]."""
     count = sum(len(keyframe.features.views) for keyframe in places.keyframes.values())
     fused = VoxelMap(voxel_m, count)
     for id in sorted(places.keyframes):

@@ -25,7 +25,7 @@ Indices = NDArray[np.intp]
 
 # Squared Mahalanobis distance of a right loop, because 99 % are below it (chi-squared, 6 dimensions).
 LARGEST_SQUARED: Final = 16.8
-# M and rad: a smaller step is the last one, once all weights are 0 or 1, because no map is so exact.
+# m and rad: a smaller step is the last one, once all weights are 0 or 1, because no map is so exact.
 CONVERGED: Final = 1e-5
 DAMPING: Final = 1e-6  # added to the diagonal, 1/m^2 and 1/rad^2, so that nodes which no edge holds stay where they are
 

@@ -32,7 +32,7 @@ class PaddedPanorama:
     period_px: int = 0  # columns of a full turn, of which a sector has some; 0: all of them
     first: int = 0  # column of the full turn that is column 0
     jpeg_steps: Steps = ()  # of the quantisation of the image's JPEG, (): none
-    scale: float = 1.0  # columns by those of the images' own resolution
+    scale: float = 1.0  # columns as a fraction of those at the images' own resolution
 
     def __post_init__(self) -> None:
         if not self.period_px:

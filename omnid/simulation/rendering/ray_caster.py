@@ -144,7 +144,8 @@ def render_rays(scene: Scene, table: RayTable, T_world_cam: Array, size: tuple[i
     surfaces = _surfaces([scene[i] for i in order], T_world_cam, distance_m - reach_m)
     seen = tiles_that_see(table, corners, np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
     # 2. The greys of all samples.
-    atlas, image = cached_atlas([r.texture for r in scene]), np.zeros(width * height, np.float32)
+    textures, image = [r.texture for r in scene], np.zeros(width * height, np.float32)
+    atlas = _remembered(_atlases, tuple(map(id, textures)), lambda: _make_atlas(textures))
     cast(
         table.rays,
         table.origins,
@@ -214,12 +215,7 @@ class Atlas:
     levels: NDArray[np.int64]  # (L, 3) first texel, height, width
 
 
-_atlases: dict[Hashable, Atlas] = {}  # by the ids of the textures
-
-
-def cached_atlas(textures: Sequence[Texture]) -> Atlas:
-    """Return the atlas of textures, made once for a scene."""
-    return _remembered(_atlases, tuple(map(id, textures)), lambda: _make_atlas(textures))
+_atlases: dict[Hashable, Atlas] = {}  # of scenes, by the ids of their textures
 
 
 def _make_atlas(textures: Sequence[Texture]) -> Atlas:

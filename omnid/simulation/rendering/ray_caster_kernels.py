@@ -1,7 +1,9 @@
 """Compiled loops of the ray caster: for every sample the nearest rectangle, and the grey of its texture there.
 
 The rays of a tile are tried against one rectangle after the other, in loops without branches that the compiler turns
-into vector instructions.
+into vector instructions. The rows of a surface (4, 4) are: distance from its plane [m], fraction u and fraction v of a
+point, each by the gradient (3) and the value at the frame's origin; then brightness, texels per m^2, least distance
+from the origin of any ray, 0.
 """
 
 from __future__ import annotations
@@ -16,8 +18,6 @@ Whole = NDArray[np.int64]
 Numbers = NDArray[np.int32]
 Rows = tuple[Floats, Floats, Floats]  # x, y, z (N,), each contiguous: loops over columns become vector instructions
 MIN_SLANT = np.float32(0.02)  # Least cosine between a ray and a rectangle's normal in a sample's footprint.
-# Rows of a surface (4, 4): distance from its plane [m], fraction u and fraction v of a point, each by the gradient (3)
-# and the value at the frame's origin; then brightness, texels per m^2, least distance from the origin of any ray, 0.
 ZERO, HALF, ONE, FAR_M = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(np.inf)
 # Fractions u, v of a rectangle: it reaches beyond its outline by the rounding, so that no ray passes between two walls.
 LOW_EDGE, HIGH_EDGE = np.float32(-2e-6), np.float32(1.0 + 2e-6)

@@ -18,12 +18,12 @@ from tests.waiting import wait_until
 MOTIONS: Final = ("cmd/heading", "cmd/twist", "cmd/planner/twist", "cmd/unknown")
 MANUAL: Final = ("--set", "controller.arming=manual")
 OLD_S: Final = 3600.0
-BATCH: Final = 500  # commands between two looks at the daemon
+BATCH: Final = 500  # commands between two checks of the daemon
 SETTLE_S: Final = 1.0
 
 
 def command(rng: random.Random, topics: Sequence[str], age_s: float) -> tuple[str, bytes]:
-    """Return topic and payload of a mutated command whose stamp is so old before the mutation."""
+    """Return topic and payload of a command with a stamp of this age, mutated after it was made."""
     stamp_ns = time.time_ns() - round(age_s * 1e9)
     payload = rng.choice(
         (
@@ -43,7 +43,7 @@ def counted(operator: Operator) -> int:
 
 
 def attack(operator: Operator, rng: random.Random, count: int, topics: Sequence[str], age_s: float) -> None:
-    """Send mutated commands, and wait until the daemon has counted them all, beside those of the operator."""
+    """Send mutated commands, and wait until the daemon has counted them all, with those of the operator."""
     before = counted(operator)
     for sent in range(1, count + 1):
         operator.send(*command(rng, topics, age_s))

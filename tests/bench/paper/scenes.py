@@ -58,8 +58,8 @@ def facing(seed: int, size: int, pairs: int) -> SimulatedRun:
         "floor",
     )
     scene = Scene((replace(front, name="wall"), *others, floor))
-    aside = np.column_stack([np.zeros(pairs), 0.07 * (np.arange(pairs) - (pairs - 1) / 2)])
-    return SimulatedRun(make_rig(size=size), paths.planar_poses(aside, np.zeros(pairs)), scene)
+    sideways = np.column_stack([np.zeros(pairs), 0.07 * (np.arange(pairs) - (pairs - 1) / 2)])
+    return SimulatedRun(make_rig(size=size), paths.planar_poses(sideways, np.zeros(pairs)), scene)
 
 
 def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:

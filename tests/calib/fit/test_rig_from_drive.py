@@ -87,7 +87,7 @@ def test_a_disturbed_rig_becomes_the_true_one(truth: Rig) -> None:
 
 
 def test_sigmas_are_those_of_the_errors(truth: Rig) -> None:
-    """Errors over said sigmas are of order one, over all parameters of some drives."""
+    """Errors divided by their sigmas are of order one, over all parameters of some drives."""
     parameters = RigParameters.about(truth)
     ratios = []
     for seed in range(2):

@@ -17,12 +17,7 @@ import pytest
 
 from drivers.cameras import v4l2_ioctl
 from drivers.cameras import v4l2_ioctl as v4l2
-from drivers.cameras.camera_state import (
-    CameraExposure,
-    CameraState,
-    ExposureRequest,
-    ExposureSetting,
-)
+from drivers.cameras.camera_state import CameraExposure, CameraState, ExposureRequest, ExposureSetting
 from drivers.cameras.v4l2_camera import BufferChecks, V4l2Camera
 from drivers.cameras.v4l2_device import (
     V4l2Settings,

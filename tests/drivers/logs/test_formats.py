@@ -101,7 +101,7 @@ def survivors(path: Path) -> tuple[Contents, LogReader] | None:
 
 
 def is_one_fault(warnings: list[str]) -> bool:
-    """True if a corrupt record is told, and where it is."""
+    """True if one corrupt record is reported, with its place."""
     return [re.sub("byte [0-9].*", "byte", line) for line in warnings] == [
         "skipped 1 corrupt chunks or records of the file; the first: the chunk at byte"
     ]
@@ -304,7 +304,7 @@ def chunk(compression: str, size: int, packed: bytes, crc: int = 0) -> bytes:
 
 
 def bomb(name: str, pack: Callable[[bytes], bytes]) -> bytes:
-    """Return a chunk that becomes 400 MB, and says that it is smaller."""
+    """Return a chunk that becomes 400 MB, and states a smaller size."""
     return chunk(name, 1000, pack(bytes(400 * 2**20)))
 
 

@@ -79,7 +79,7 @@ CONTROLLERS: dict[str, tuple[Callable[[], MotorProtocol], bytes, list[bytes]]] =
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_bytes_of_a_command_and_status_in_the_units_of_the_base(name: str) -> None:
+def test_a_command_has_the_bytes_of_the_manual_and_a_status_the_units_of_the_base(name: str) -> None:
     make, sent, replies = CONTROLLERS[name]
     assert next(make().drive(TURN)) == sent
     status = result(make().drive(TURN), *replies)
@@ -112,7 +112,7 @@ def line(body: bytes) -> bytes:
     return b"$%b*%04X\n" % (body, crc16(body))
 
 
-def test_known_lines() -> None:
+def test_the_lines_have_the_documented_bytes() -> None:
     protocol = LineProtocol(DRIVE)
     assert next(protocol.connect(500)) == line(b"W,500")
     drive = protocol.drive(VelocityCommand(99, 0.3, -1.571, 0.0504))
@@ -208,7 +208,7 @@ def test_odrive_never_clears_other_errors() -> None:
     assert result(armed().drive(TURN), *lines("0 0", "0 0", "1", "2048", "24")).fault == 1
 
 
-def test_odrive_only_a_stop_arms_an_expired_axis() -> None:
+def test_only_a_stop_arms_an_expired_axis_of_an_odrive() -> None:
     protocol = armed()
     status = result(protocol.drive(TURN), *lines("0 0", "0 0", "0", "2048", "24"))
     assert status.watchdog_expired and status.fault == 0
@@ -224,7 +224,7 @@ def test_odrive_only_a_stop_arms_an_expired_axis() -> None:
 # VESC
 
 
-def test_vesc_packets_as_the_firmware_makes_them() -> None:
+def test_vesc_packets_are_those_of_the_firmware() -> None:
     assert packet(b"\x00") == bytes.fromhex("02 01 00 00 00 03")  # COMM_FW_VERSION
     assert packet(b"\x04") == bytes.fromhex("02 01 04 40 84 03")  # COMM_GET_VALUES
     assert packet(bytes(256))[:3] == b"\x03\x01\x00"

@@ -199,8 +199,8 @@ def test_four_cameras_stream_at_their_rate(vivid: None, loopback: None) -> None:
         watched.require_events("clock")
 
 
-def test_counts_dropped_buffers(vivid: None) -> None:
-    """The count is that of the gaps in the stamps, which the virtual camera sets late on a busy machine."""
+def test_dropped_buffers_are_counted(vivid: None) -> None:
+    """The count equals the gaps in the stamps, which the virtual camera sets late on a busy machine."""
     with CameraReader(controls=(*STILL, "percentage_of_dropped_buffers=40"), rate_hz=25.0) as watched:
         watched.more(60)
     watched.require_order()

@@ -24,10 +24,10 @@ from tests.hardware.guest.surroundings import (
     SampleLog,
     journal,
     load_loopback,
-    restarted,
     run,
     show,
     until,
+    wait_for_restart,
 )
 
 CURSOR = Path("/run/journal-of-the-tests")
@@ -215,7 +215,7 @@ def test_a_killed_daemon_stops_the_wheels_until_it_is_back(operator: GuestOperat
     assert after["expiries"] == before["expiries"], "the base controller stopped them, long before the watchdog"
     until(lambda: int(show("MainPID")) not in (0, pid))
     assert wheels.state()["fastest_mps"] == 0.0
-    restarted(pid)
+    wait_for_restart(pid)
     operator.more(3)
     until(lambda: wheels.commanded_mps > 0.25)
     assert wheels.state()["unsafe_resumes"] == 0
@@ -225,7 +225,7 @@ def test_restarts_a_daemon_that_stalls(operator: GuestOperator, wheels: Wheels) 
     pid = int(show("MainPID"))
     os.kill(pid, signal.SIGSTOP)
     until(lambda: wheels.commanded_mps == 0.0)
-    restarted(pid)
+    wait_for_restart(pid)
     lines = journal()
     assert any("Watchdog timeout" in text for text in lines)
     assert any("Fatal Python error: Aborted" in text for text in lines)

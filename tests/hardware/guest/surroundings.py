@@ -45,7 +45,7 @@ def until(what: Callable[[], object]) -> None:
         time.sleep(0.3)
 
 
-def restarted(pid: int) -> None:
+def wait_for_restart(pid: int) -> None:
     """Wait until another process is the daemon."""
     until(lambda: int(show("MainPID")) not in (0, pid) and show("ActiveState") == "active")
 
@@ -134,7 +134,7 @@ class GuestOperator:
             except Unreachable:
                 if time.monotonic() > deadline_s:
                     raise
-        self._robot.on_message(self._take)
+        self._robot.on_message(self._receive)
         self._leaving = threading.Event()
         self._thread = threading.Thread(target=self._drive, daemon=True)
         self._thread.start()
@@ -156,7 +156,7 @@ class GuestOperator:
         until(lambda: len(self.poses) >= before + count)
         return self.poses[before:]
 
-    def _take(self, topic: str, payload: bytes, note: bytes) -> None:
+    def _receive(self, topic: str, payload: bytes, note: bytes) -> None:
         if topic == "odom":
             self.poses.append(decode_pose(payload, note))
             self._sample_log.on_pose(self.poses[-1].stamp_ns - self._offset_ns)

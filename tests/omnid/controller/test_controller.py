@@ -18,17 +18,9 @@ from omnid.controller.controller import Controller
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
-from omnid.core.control.heading_controller import (
-    Setpoint,
-    VelocityLimits,
-)
+from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.safety_rules import POSE_JUMPED, Deadlines
-from tests.omnid.controller.bench import (
-    LIMITS,
-    PERIOD_S,
-    UNATTENDED,
-    Bench,
-)
+from tests.omnid.controller.bench import LIMITS, PERIOD_S, UNATTENDED, Bench
 
 HOLDER_LIMITS = VelocityLimits(yaw_rate_radps=1.0)
 HOLDER_SETTINGS = ControllerSettings(Deadlines(5.0, 5.0, 5.0), HOLDER_LIMITS, arming=AUTOMATIC).without_obstacles

@@ -29,13 +29,7 @@ from omnid.core.control.collision_monitor import (
     MovingPoint,
 )
 from omnid.core.control.control_law import ControllerPose
-from omnid.core.control.heading_controller import (
-    LONGEST_TICK_S,
-    STOP,
-    Setpoint,
-    Twist,
-    wrap_angle,
-)
+from omnid.core.control.heading_controller import LONGEST_TICK_S, STOP, Setpoint, Twist, wrap_angle
 from omnid.core.control.motion_monitor import AGREE, CONFLICTS, Conflict
 from omnid.core.control.safety_rules import BUMPER, CLIFF
 from tests.omnid.controller.bench import LIMITS, PERIOD_NS, PERIOD_S, SETTINGS
@@ -64,8 +58,6 @@ ODDITIES = (
     (0, 12.0, None, 1.5, 0.0),
     (0, 12.0, None, math.nan, 1.0),
 )
-
-
 AWAITED_TICKS = 50  # before the motor controller answers for the first time
 
 
@@ -410,5 +402,5 @@ def test_nothing_moves_without_arm_and_a_live_command_of_the_owner(mode: str) ->
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("mode", [MANUAL, AUTOMATIC])
-def test_the_same_in_a_million_ticks(mode: str, seed: int) -> None:
+def test_nothing_moves_without_arm_and_a_live_command_in_a_million_ticks(mode: str, seed: int) -> None:
     walk(100 + seed, mode, MANY_TICKS // 20)

@@ -48,7 +48,7 @@ def test_numbers_tuples_strided_and_read_only_arrays_and_named_arguments_are_pas
     ],
     ids=str,
 )
-def test_other_types_are_an_error_and_not_a_wait(wrong: dict[str, object]) -> None:
+def test_other_types_are_refused_and_not_compiled(wrong: dict[str, object]) -> None:
     right = {"number": 1, "real": 0.5, "two": (1.0, 2.0), "values": np.zeros(4), "out": np.zeros(7)}
     with pytest.raises(TypeError):
         listed(**(right | wrong))

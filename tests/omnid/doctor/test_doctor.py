@@ -25,7 +25,7 @@ from tests.replay.command import Command
 ROOT = Path(__file__).parents[3]
 
 
-class Robot:
+class DeviceTree:
     """A tree like /dev with two cameras and their persistent names."""
 
     def __init__(self, root: Path) -> None:
@@ -46,24 +46,24 @@ class Robot:
 
 
 @pytest.fixture
-def robot(tmp_path: Path) -> Robot:
-    return Robot(tmp_path)
+def tree(tmp_path: Path) -> DeviceTree:
+    return DeviceTree(tmp_path)
 
 
-def test_the_doctor_accepts_cameras_that_are_connected(robot: Robot) -> None:
-    first, second = robot.examined()
+def test_the_doctor_accepts_cameras_that_are_connected(tree: DeviceTree) -> None:
+    first, second = tree.examined()
     assert str(first) == "ok       camera lower  HD Webcam at /dev/video0"
     assert second.level == "ok" and "/dev/video2" in second.found
 
 
-def test_the_doctor_finds_faults_of_cameras(robot: Robot) -> None:
-    (missing, right) = robot.examined(lower="/dev/omnid/lowest")
+def test_the_doctor_finds_faults_of_cameras(tree: DeviceTree) -> None:
+    (missing, right) = tree.examined(lower="/dev/omnid/lowest")
     assert missing.level == "error" and "/dev/omnid/lowest does not exist" in missing.found
     assert "omnid cameras" in missing.advice and right.level == "ok"
-    (robot.root / "dev/null").touch()
-    assert "is no camera" in robot.examined(lower="/dev/null")[0].found
-    robot.known[0] = replace(robot.known[0], problem="is broken; mend it")
-    assert "is broken" in str(robot.examined()[0]) and robot.examined()[0].level == "error"
+    (tree.root / "dev/null").touch()
+    assert "is no camera" in tree.examined(lower="/dev/null")[0].found
+    tree.known[0] = replace(tree.known[0], problem="is broken; mend it")
+    assert "is broken" in str(tree.examined()[0]) and tree.examined()[0].level == "error"
 
 
 @pytest.fixture

@@ -199,7 +199,7 @@ def test_a_copy_under_another_name_is_refused(tmp_path: Path) -> None:
         ({"more": 1}, "unknown field `more`"),
     ],
 )
-def test_a_map_that_does_not_fit_is_refused_in_one_line(change: dict[str, object], words: str) -> None:
+def test_a_route_that_does_not_fit_is_refused_in_one_line(change: dict[str, object], words: str) -> None:
     content = json.loads(route_bytes(route())) | change
     with pytest.raises(OmnidError, match=words) as error:
         parse_route(json.dumps(content).encode(), "r")

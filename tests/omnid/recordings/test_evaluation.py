@@ -159,7 +159,7 @@ def test_the_axes_of_another_body_are_fitted(
     assert "try `omnid eval --frame auto`" in capsys.readouterr().out
 
 
-# The rule for which topic holds the poses: one table of cases, through all commands that read recorded runs
+# Which topic of a recording holds the poses
 
 
 START_NS = 1_700_000_000 * 10**9

@@ -90,7 +90,7 @@ def test_the_unit_allows_what_the_configuration_asks_for() -> None:
 
 def test_the_examples_of_udev_are_commented() -> None:
     lines = RULES.read_text().splitlines()
-    assert all(line.startswith("#") for line in lines if line)  # before somebody puts in his ports
+    assert all(line.startswith("#") for line in lines if line)  # before somebody enters their ports
 
 
 FILES = ("etc/systemd/system/omnid.service", "etc/udev/rules.d/90-omnid.rules", "etc/omnid/omnid.toml")

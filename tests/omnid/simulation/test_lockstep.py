@@ -112,14 +112,14 @@ def test_a_base_stops_within_a_second_where_half_of_the_images_freezes_ahead() -
     assert 0.0 < stop_s(run, UNOBSERVED) < 1.0
     speeds = np.linalg.norm(np.diff([tick.pose[:2] for tick in run.ticks], axis=0), axis=1)
     assert speeds[-20:].max() < 1e-4
-    # Landmarks in the dead half would say that the base stands.
+    # Landmarks in the dead half would show a base at rest.
     np.testing.assert_allclose(run.T_odom_base[-1, :2, 3], run.truth_in_odom[-1, :2, 3], atol=0.03)
     assert {pose.state for pose in run.poses[5:]} <= {"tracking", "degraded"}
 
 
 @pytest.mark.hazard("H22")
 def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
-    """A third of the images, behind it."""
+    """A third of the images freezes, behind the base."""
     run = fine_drive(Frozen(BEHIND, starts_s=STARTS_S))
     assert not [line for _, line in run.lines if UNOBSERVED in line]
     np.testing.assert_allclose(run.T_odom_base[-1, :2, 3], run.truth_in_odom[-1, :2, 3], atol=0.03)
@@ -128,7 +128,7 @@ def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
 @pytest.mark.hazard("H23")
 @pytest.mark.parametrize("gyro", [True, False])
 def test_in_the_dark_a_base_stops_although_wheels_carry_its_pose(gyro: bool) -> None:
-    """Half a second, and the ramp."""
+    """Within half a second, and the time of the ramp."""
     robot, dark = replace(make_robot(SIZE_PX), samples=1), Fault("dark", STARTS_S, 9.0)
     config = load_config(None, ["places.enabled=false", f"motion.imu={'auto' if gyro else 'off'}"])
     run = simulate(world(), robot, ahead, seconds=3.0, seed=1, config=config, faults=(dark,))

@@ -162,7 +162,9 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
         recorder.process(Diagnostics(stamp_ns, (DiagnosticStatus("omnid: test", 0, "fine", {}),)))
         if n in (9, 19):
             computer.set_forwards(step_s)
-        recorder.process(replace(odometry(n), stamp_ns=stamp_ns))  # of images of before the step, later than it
+        recorder.process(
+            replace(odometry(n), stamp_ns=stamp_ns)
+        )  # Its images are from before the step, and it comes after it.
     recorder.close()
     written = []
     for path in recorded(tmp_path / "log"):

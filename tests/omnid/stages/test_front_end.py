@@ -1,7 +1,4 @@
-"""From images to poses and depth: panoramas, the check of the rig, features, dense depth, and what is dropped.
-
-On the frames of a rendered run.
-"""
+"""From images of a rendered run to poses and depth: panoramas, features, dense depth, and what is dropped."""
 
 from __future__ import annotations
 
@@ -114,7 +111,7 @@ def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
 
 
 def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: list[Frame]) -> None:
-    """It holds all messages until all poses are there."""
+    """The bus holds all messages until all poses are there."""
     graph, statistics, complete = Graph(drops=True, depth=1), RunStatistics(), threading.Event()
 
     class Complete:
@@ -137,8 +134,8 @@ def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: l
     assert statistics.poses == graph.stats["odometry"].processed
 
 
-def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: list[Frame]) -> None:
-    """One thread makes a pose of the newest images; each that is decoded gets one, however fast images come."""
+def test_old_images_of_a_live_run_are_dropped_before_any_work(place: Geometry, frames: list[Frame]) -> None:
+    """One thread estimates poses from the newest images: each decoded pair has a pose, however fast images come."""
     graph, statistics = Graph(drops=True, depth=1), RunStatistics()
     stages = FrontEnd(place, CONFIG)
     cameras = {
@@ -149,13 +146,13 @@ def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: li
     poses = wire(CONFIG, inputs, stages, graph).poses
     graph.sink("statistics", statistics, poses, thread=poses.thread)
     graph.run()
-    of = graph.stats.__getitem__
-    assert of("pair").dropped > 0 and of("odometry").dropped == 0
+    stats = graph.stats
+    assert stats["pair"].dropped > 0 and stats["odometry"].dropped == 0
     assert (
         0
         < statistics.poses
-        == of("dewarp").processed
-        == of("odometry").processed
-        == of("odometry completion").processed
+        == stats["dewarp"].processed
+        == stats["odometry"].processed
+        == stats["odometry completion"].processed
     )
-    assert of("pair").dropped + of("pair").processed == 2 * PAIRS
+    assert stats["pair"].dropped + stats["pair"].processed == 2 * PAIRS

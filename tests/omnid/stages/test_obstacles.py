@@ -77,8 +77,8 @@ SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)
 PERIOD_NS = 100_000_000
 
 
-class Standing:
-    """A base that does not move, with cameras so high over the floor."""
+class BaseAtRest:
+    """A base that does not move, with cameras at a height above the floor."""
 
     def __init__(self, height_m: float, ahead_m: float = 0.0) -> None:
         T_base_rig = se3.transform(np.eye(3), [ahead_m, 0.0, height_m])
@@ -105,8 +105,8 @@ class Standing:
 
 
 def test_the_grid_is_valid_again_when_odometry_recognises_its_landmarks() -> None:
-    """A low thing that was seen from farther away: nothing shows it here, so that it would never be found again."""
-    base = Standing(HEIGHT_M)
+    """A low object that was seen from farther away: no image shows it here, so that it would never be found again."""
+    base = BaseAtRest(HEIGHT_M)
     pairs = [Panoramas(0, 0, *panoramas(stains, 3.0, striped, seed=seed), SHOWN) for seed in range(3)]
     for seq in range(20):
         base.scan(pairs[seq % 3])
@@ -126,8 +126,8 @@ def test_the_grid_is_valid_again_when_odometry_recognises_its_landmarks() -> Non
     assert scan.ranges_m[270] == pytest.approx(2.0, abs=0.1) and not begun_again.ranges_m[270] < 2.5
 
 
-def test_grid_has_floor_before_a_wall_the_wall_and_nothing_known_behind() -> None:
-    base, x_m = Standing(HEIGHT_M), 0.33
+def test_the_grid_has_free_floor_before_a_wall_the_wall_and_unknown_cells_behind_it() -> None:
+    base, x_m = BaseAtRest(HEIGHT_M), 0.33
     for seed in range(6):
         scan = base.scan(Panoramas(0, 0, *panoramas(stains, 2.0, striped, seed=seed), SHOWN), x_m=x_m)
     assert scan.grid is not None
@@ -139,18 +139,16 @@ def test_grid_has_floor_before_a_wall_the_wall_and_nothing_known_behind() -> Non
 
 @pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
 def test_floor_between_edges_is_free_where_the_rig_states_its_height_and_nothing_is_elsewhere(height_m: float) -> None:
-    scan = Standing(height_m).scan(Panoramas(0, 0, *panoramas(worn, 9.0, plain), SHOWN))
+    scan = BaseAtRest(height_m).scan(Panoramas(0, 0, *panoramas(worn, 9.0, plain), SHOWN))
     assert np.isnan(scan.ranges_m).all()
     assert np.median(scan.free_m) > 2.0 if height_m else scan.free_m.max() == 0.0
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), [(0.15, 0.2), (-0.15, -0.1)])
 def test_known_cells_stay_at_their_place_in_odom_as_the_base_moves(x_m: float, y_m: float) -> None:
-    """A low thing nearer than the floor in view, one beside the base, and the free floor too near to be seen."""
-    base, pairs = (
-        Standing(HEIGHT_M),
-        [Panoramas(0, 0, *panoramas(stains, 3.0, striped, seed=seed), SHOWN) for seed in range(3)],
-    )
+    """A low object nearer than the floor in view, one next to the base, and the free floor too near to be seen."""
+    base = BaseAtRest(HEIGHT_M)
+    pairs = [Panoramas(0, 0, *panoramas(stains, 3.0, striped, seed=seed), SHOWN) for seed in range(3)]
     for seq in range(6):
         base.scan(pairs[seq % 3])
     odds = base.obstacles.scans.grid.odds
@@ -175,7 +173,7 @@ def test_columns_of_tiles_are_sectors_about_the_same_azimuth() -> None:
     assert (np.flatnonzero(sectors_of(left, CYLINDER, np.eye(4), RANGES_M)) - 180 > 80).all()
 
 
-def test_tiles_of_a_viewpoint_beside_the_origin_cover_near_and_far_directions() -> None:
+def test_tiles_of_a_viewpoint_next_to_the_origin_cover_near_and_far_directions() -> None:
     """Cameras 0.3 m to the left: what is ahead of them is to the left of the base where it is near."""
     found = sectors_of(DEAD, CYLINDER, se3.transform(np.eye(3), [0.0, 0.3, 0.9]), RANGES_M)
     for range_m in (0.6, 1.2, 4.0):
@@ -187,7 +185,7 @@ ROOM_HEIGHT_M = test_floor.HEIGHT_M
 BOX_M, WALL_M = 1.4, 2.4
 AHEAD = np.abs(azimuths()) < 0.25  # of the rig, whose x is forward
 UNKNOWN_M = np.full(SECTORS, np.nan, np.float32)
-NOTHING = ObstacleScan(0, 0, UNKNOWN_M, UNKNOWN_M, np.zeros(SECTORS, np.float32), np.eye(4))
+NO_SCAN = ObstacleScan(0, 0, UNKNOWN_M, UNKNOWN_M, np.zeros(SECTORS, np.float32), np.eye(4))
 
 
 def depth(T_rig_level: np.ndarray) -> DensePoints:
@@ -210,12 +208,12 @@ def test_a_low_box_before_a_wall_is_the_nearest_obstacle(tilt_deg: float) -> Non
     tilt = se3.transform(se3.rotation_exp(np.deg2rad([0.0, tilt_deg, 0.0])), np.zeros(3))
     stated = se3.transform(np.eye(3), [0.0, 0.0, ROOM_HEIGHT_M])
     rig = replace(make_rig(), T_base_rig=stated @ se3.inverse(tilt))  # a stated pose holds the tilt as well
-    scan, _ = keyframe_ranges(depth(tilt), NOTHING, floor_frame(rig, 0.0), np.eye(4), ScanSettings())
+    scan, _ = keyframe_ranges(depth(tilt), NO_SCAN, floor_frame(rig, 0.0), np.eye(4), ScanSettings())
     np.testing.assert_allclose(scan[AHEAD], BOX_M, atol=0.08)
     np.testing.assert_allclose(scan[np.abs(azimuths()) > 0.5], WALL_M, atol=0.15)
 
 
 def test_without_a_height_nothing_is_known() -> None:
     floor = floor_frame(make_rig(), 0.0)
-    scan, _ = keyframe_ranges(depth(np.eye(4)), NOTHING, floor, np.eye(4), ScanSettings())
+    scan, _ = keyframe_ranges(depth(np.eye(4)), NO_SCAN, floor, np.eye(4), ScanSettings())
     assert np.isnan(scan).all()

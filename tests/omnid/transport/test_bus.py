@@ -367,6 +367,22 @@ def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:
             assert sender.ask(0.3) == "" and not commands, "it is for another robot"
 
 
+def test_a_confirmed_stop_stays_confirmed_when_an_older_answer_comes_by_another_way() -> None:
+    endpoints = (free_endpoint(), free_endpoint())
+    with contextlib.ExitStack() as closing, ThreadPoolExecutor(1) as thread:
+        sender = closing.enter_context(contextlib.closing(StopSender("rover", endpoints)))
+        listeners = []
+        for endpoint, is_stopped in zip(endpoints, (True, False), strict=True):
+            config = BusConfig(robot="rover", listen=(endpoint,))
+            listener = StopListener(config, lambda: None, lambda is_stopped=is_stopped: is_stopped)  # type: ignore[misc]
+            listeners.append(closing.enter_context(contextlib.closing(listener)))
+        answer = thread.submit(sender.ask, 1.0)
+        while not answer.done():
+            for listener in listeners:
+                listener.process()
+        assert answer.result() == STOPPED
+
+
 def test_other_datagrams_do_not_stop_and_answers_are_no_longer_than_requests() -> None:
     endpoint = free_endpoint()
     host, port = next(iter(addresses((endpoint,))))

@@ -98,27 +98,27 @@ def served(*words: object) -> Iterator[WebServer]:
 
 
 class Shown:
-    """Content of a page: the newest news of each kind; they are asked for as the page does."""
+    """Content of a page: the newest value of each kind, asked for as the page does."""
 
     def __init__(self, server: WebServer) -> None:
         self._server, self._seen = server, 0
         self.newest: dict[str, Any] = {}
 
     def read(self) -> None:
-        """Take the next news."""
+        """Receive what is new since the last call."""
         answer = self._server.request(f"/live?seen={self._seen}", headers=self._server.bearer)
         assert answer.status == 200, answer.text
-        news = json.loads(answer.text)
-        self._seen = news.pop("seen")
-        self.newest |= news
+        values = json.loads(answer.text)
+        self._seen = values.pop("seen")
+        self.newest |= values
 
     def until(
         self, kind: str, action: Callable[[], object] = lambda: None, holds: Callable[[Any], object] = lambda _: True
     ) -> Any:
-        """Repeat an action and take news until those of a kind are there for which a condition holds; return them."""
+        """Repeat an action and read until a value of a kind is there for which a condition holds; return it."""
         end_s = time.monotonic() + PATIENCE_S
         while kind not in self.newest or not holds(self.newest[kind]):
-            assert time.monotonic() < end_s, f"no such news {kind!r} within {PATIENCE_S:g} s: {self.newest}"
+            assert time.monotonic() < end_s, f"no such {kind!r} within {PATIENCE_S:g} s: {self.newest}"
             action()
             self.read()
         return self.newest[kind]

@@ -59,9 +59,9 @@ class Navigator:
 
     def __init__(self, bus: Bus) -> None:
         self._bus, self.asked, self.state = bus, list[str](), "driving"
-        bus.subscribe_commands(self._take)
+        bus.subscribe_commands(self._receive)
 
-    def _take(self, request: Request) -> None:
+    def _receive(self, request: Request) -> None:
         text = string_from_cdr(request.payload)
         self.asked.append(text)
         self._bus.answer({request.id: Answer(True, f"does {text}")})
@@ -148,7 +148,7 @@ def expect_it_fits(page: Any, size: str) -> None:
             assert 0 <= control["y"] <= control["y"] + control["height"] <= box["y"], name
 
 
-def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
+def test_obstacles_and_the_coverage_of_a_calibration_are_shown(browser: Any) -> None:
     endpoint = free_endpoint()
     ranges = (1.5 + np.abs(np.sin(np.linspace(0, 9, 360)))).astype(np.float32)
     digits = "".join(str(number % 5) for number in range(36))

@@ -386,10 +386,10 @@ def test_obstacles_are_drawn_from_the_pose_nearest_in_time() -> None:
     found = scan_news(scan(ranges, azimuths), poses)
     np.testing.assert_allclose(found["points"], [(1.0, 4.0), (2.5, 2.0)], atol=1e-3)
     assert found["nearest"] == pytest.approx([1.5, -90.0])
-    nothing = {"points": [], "nearest": None}
-    assert scan_news(scan(ranges, azimuths, "map"), poses) == nothing
-    assert scan_news(scan(ranges, azimuths), []) == nothing
-    assert scan_news(scan([math.inf], [0.0]), poses) == nothing
+    no_scan = {"points": [], "nearest": None}
+    assert scan_news(scan(ranges, azimuths, "map"), poses) == no_scan
+    assert scan_news(scan(ranges, azimuths), []) == no_scan
+    assert scan_news(scan([math.inf], [0.0]), poses) == no_scan
 
 
 # The feed.

@@ -12,12 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from omnid.core.control import collision_monitor as monitor_module
-from omnid.core.control.collision_monitor import (
-    CollisionMonitor,
-    CollisionSettings,
-    ControllerScan,
-    MovingPoint,
-)
+from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan, MovingPoint
 from omnid.core.control.heading_controller import Twist
 
 S = 1_000_000_000
@@ -159,8 +154,8 @@ def test_a_wall_that_is_seen_past_an_unknown_place_makes_it_no_freer() -> None:
 
 
 @pytest.mark.hazard("H19")
-def test_a_place_beside_before_which_a_wall_is_seen_does_not_keep_a_base_from_turning() -> None:
-    """A person there would hide the wall."""
+def test_an_unknown_place_at_the_side_with_a_wall_seen_behind_it_does_not_keep_a_base_from_turning() -> None:
+    """A person in that place would hide the wall."""
     free = tuple(0.0 if -150 < k - 179.5 < -100 else 3.0 for k in range(360))
     swings = Twist(0.3, 0.6)
     assert after((3.0,) * 360, swings, free=free) == (swings, "")
@@ -170,7 +165,7 @@ def test_a_place_beside_before_which_a_wall_is_seen_does_not_keep_a_base_from_tu
 @pytest.mark.hazard("H19")
 @pytest.mark.parametrize(("yaw_rate_radps", "goes_on"), [(0.0, True), (0.05, True), (-0.05, True), (0.2, False)])
 def test_a_base_drives_along_what_is_unknown_beside_it(yaw_rate_radps: float, goes_on: bool) -> None:
-    """A corrected heading takes a corner nearer by a little; a turn into it is another thing, and so is an obstacle."""
+    """A corrected heading takes a corner nearer by a little; a turn into it is refused, and an obstacle counts."""
     motion = Twist(0.5, yaw_rate_radps)
     for way in (1, -1):
         beside, turned = with_unknown(45, 135), Twist(way * 0.5, motion.yaw_rate_radps)
@@ -248,7 +243,7 @@ def test_the_base_is_at_rest_before_a_person_beside_its_way_who_turns_towards_it
 
 @pytest.mark.hazard("H17")
 def test_a_new_moving_obstacle_slows_the_base_down_where_it_may_go() -> None:
-    """Seen twice, it seems to walk beside the way; three looks make the sigma smaller than 0.4 m/s."""
+    """Seen twice, it seems to walk next to the way; a third observation makes the sigma smaller than 0.4 m/s."""
     new = MovingPoint(1.0, 1.6, 0.0, -0.1, 0.2, 0.1, 0.6)
     allowed, reason = after(FREE_SCAN, moving=(new,))
     assert allowed.velocity_mps == pytest.approx(0.4) and reason == monitor_module.MOVING
@@ -256,7 +251,7 @@ def test_a_new_moving_obstacle_slows_the_base_down_where_it_may_go() -> None:
     assert after(FREE_SCAN, moving=(new._replace(y_m=3.0),)) == (AHEAD, "")
 
 
-def test_never_gives_more_than_was_asked_nor_another_direction() -> None:
+def test_the_monitor_never_allows_more_than_was_asked_nor_another_direction() -> None:
     rng = random.Random(3)
     reasons = set()
     for _ in range(2000):
@@ -304,7 +299,7 @@ def depth_m(box: Box, points: Complex) -> Array:
 
 
 def seen_after(motion: Pair, points: Complex, times: Array) -> Complex:
-    """Return points that stand in the axes of the base after times [s] of a motion, (times, points)."""
+    """Return points at rest in the axes of the base after times [s] of a motion, (times, points)."""
     v, w = motion
     places = v * times * np.sinc(w * times / math.tau) * np.exp(0.5j * w * times)
     return np.asarray((points[None, :] - places[:, None]) * np.exp(-1j * w * times)[:, None])
@@ -357,7 +352,7 @@ def outlines(settings: CollisionSettings, v: float) -> tuple[Box, Box]:
 def share_before(
     settings: CollisionSettings, braking_mps2: float, motion: Pair, points: Complex, grow_m: float
 ) -> float:
-    """Return the share of a motion that keeps time and braking distance before points that stand."""
+    """Return the share of a motion that keeps time and braking distance before points at rest."""
     speed_mps = abs(motion[0])
     outline, box = outlines(settings, motion[0])
     within = depth_m(box, points) <= 0.0

@@ -234,7 +234,7 @@ def any_speed(rng: random.Random) -> float:
 
 @pytest.mark.hazard("H10")
 @pytest.mark.parametrize("seed", range(5))
-def test_never_exceeds_a_limit(seed: int) -> None:
+def test_no_step_exceeds_a_limit(seed: int) -> None:
     rng, sent = random.Random(seed), STOP
     for _ in range(5000):
         wanted = Twist(any_speed(rng), any_speed(rng))

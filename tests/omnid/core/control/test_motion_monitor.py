@@ -166,8 +166,7 @@ def test_rest_forgets_what_was_unexplained() -> None:
     assert held_s > 6.0 + 0.8 * REST_S and not monitor.reason and not monitor.is_doubtful
 
 
-# Trust in pose and motor: levels, times, switches, and how slowly a base drives.
-NS = 10**9
+# Trust in pose and motor: levels, times, switches.
 STILL = Motion(0.0, 0.0)
 SURE, UNSURE, TURNING = (0.01, 0.01), (0.5, 0.01), (0.01, 0.9)
 

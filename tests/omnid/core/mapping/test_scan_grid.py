@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.mapping.range_scan import (
-    FreeRanges,
-    RangeScan,
-    azimuths,
-    point_scan,
-    seen_from,
-)
+from omnid.core.mapping.range_scan import FreeRanges, RangeScan, azimuths, point_scan, seen_from
 from omnid.core.mapping.scan_grid import (
     FREE,
     MAX_CELLS,

@@ -1,4 +1,4 @@
-"""Navigation in a closed loop: goals and paths; every end is a stop, a halt has a reason, a person lifts a fault."""
+"""Navigation in a closed loop: goals and paths; every end is a stop, each stop has a reason, a person lifts a fault."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def rest(base: DrivenBase, seconds: float) -> Navigation:
     return base.samples[-1].navigation
 
 
-def assert_stands(base: DrivenBase) -> None:
+def assert_at_rest(base: DrivenBase) -> None:
     assert abs(base.v) < 0.01 and abs(base.w) < 0.02
 
 
@@ -59,7 +59,7 @@ def test_cancel_stops_at_once_and_then_gives_the_wheels_free() -> None:
     assert all(a.setpoint is not None and a.setpoint.velocity_mps == 0.0 for a in answers[1 : STOPS + 1])
     assert answers[-1].setpoint is None and answers[-1].state is NavigationState.CANCELLED
     rest(base, 1.0)
-    assert_stands(base)
+    assert_at_rest(base)
     assert base.pose[0] < 1.6
 
 
@@ -67,7 +67,7 @@ def test_a_pause_stops_the_base_and_a_resume_drives_on() -> None:
     base = driving()
     base.navigator.pause("paused by a request")
     assert rest(base, 2.0).state is NavigationState.PAUSED
-    assert_stands(base)
+    assert_at_rest(base)
     base.navigator.resume(base.seen())
     assert base.run(60).state is NavigationState.REACHED
 
@@ -93,7 +93,7 @@ def test_a_fault_pauses_the_drive_until_a_person_arms_and_resumes() -> None:
     answer = rest(base, 1.0)
     assert answer.state is NavigationState.PAUSED
     assert "`omnid goto --resume`" in answer.reason and "the pose is lost" in answer.reason
-    assert_stands(base)
+    assert_at_rest(base)
     with pytest.raises(OmnidError, match="not armed"):
         base.navigator.resume(base.seen())
     base.law.take(ArmRequest(round(base.t_s * 1e9)))
@@ -110,7 +110,7 @@ def test_a_drive_waits_where_the_map_is_lost_for_too_far() -> None:
     base.localised, x = False, base.pose[0]
     base.run(20, lambda answer: answer.state is NavigationState.NOT_LOCALISED)
     assert base.pose[0] - x == pytest.approx(SETTINGS.unlocalised_m, abs=0.25)
-    assert_stands(base)
+    assert_at_rest(base)
     base.localised = True
     assert base.run(60).state is NavigationState.REACHED
 
@@ -121,7 +121,7 @@ def test_a_drive_fails_where_the_map_is_not_found_again() -> None:
     base.localised = False
     answer = base.run(60)
     assert answer.state is NavigationState.FAILED and "not localised for 4 s" in answer.reason
-    assert_stands(base)
+    assert_at_rest(base)
 
 
 @pytest.mark.hazard("H28")
@@ -133,7 +133,7 @@ def test_a_new_odom_ends_a_drive_in_it_and_a_drive_in_the_map_waits_for_its_plac
     base = driving(NavigationFrame.MAP)
     base.resets, base.localised = 1, False
     assert rest(base, 1.0).state is NavigationState.NOT_LOCALISED
-    assert_stands(base)
+    assert_at_rest(base)
 
 
 @pytest.mark.hazard("H31")
@@ -152,7 +152,7 @@ def test_a_drive_waits_for_the_operator_and_fails_far_from_its_path() -> None:
         base.tick()
     answer = base.samples[-1].navigation
     assert answer.state is NavigationState.PAUSED and answer.reason.startswith("operator drives: it goes on when")
-    assert_stands(base)
+    assert_at_rest(base)
     base.pose = base.pose + np.array([0.0, 2.0, 0.0])
     assert "beside the path" in base.run(10).reason
 

@@ -39,7 +39,7 @@ def worn_with_line(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
 
 
 def ribbed(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-    """Return grey levels of ribs of 11 cm that are all alike, across each direction."""
+    """Return grey levels of identical ribs of 11 cm across each direction."""
     return np.asarray(120.0 + 50.0 * np.sign(np.sin(math.tau * np.hypot(x_m, y_m) / 0.11)))
 
 
@@ -56,7 +56,7 @@ def striped(azimuth: np.ndarray, height_m: np.ndarray) -> np.ndarray:
 
 
 def courses(azimuth: np.ndarray, height_m: np.ndarray) -> np.ndarray:
-    """Return grey levels of a wall of bricks: pairs of courses of 9 cm that are all alike, with joints of 1 cm."""
+    """Return grey levels of a wall of bricks: identical pairs of courses of 9 cm, with joints of 1 cm."""
     face = np.where(height_m % 0.18 < 0.09, 85.0, 95.0) + 0.0 * azimuth
     return np.where(height_m % 0.09 < 0.01, 170.0, face)
 
@@ -81,7 +81,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Block:
-    """Something low around the robot, of one grey level or with a pattern all over, with floor behind it."""
+    """A low object around the robot, of one grey level or with a pattern all over, with floor behind it."""
 
     range_m: float
     depth_m: float
@@ -102,24 +102,24 @@ class Slope:
 class Walls:
     """Two plain walls along the way, on both sides of the robot, with skirting boards."""
 
-    aside_m: float
+    lateral_m: float
     grey: float = 190.0
     board_grey: float = 60.0
 
 
-Thing = Pole | Bar | Block | Slope | Walls
+Obstacle = Pole | Bar | Block | Slope | Walls
 
 
 def panoramas(
-    floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, thing: Thing | None = None, seed: int = 4
+    floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, obstacle: Obstacle | None = None, seed: int = 4
 ) -> tuple[PaddedPanorama, PaddedPanorama]:
     """Return the lower and the upper panorama of a floor with a round wall; wall: grey of azimuth and height.
 
-    drop_m: the floor is so much lower than the base says. seed: of the noise.
+    drop_m: how far the floor lies below its height by the rig. seed: of the noise.
     """
     rng = np.random.default_rng(seed)
     lower, upper = (
-        _exposed(_drawn(height + drop_m, floor, wall_m, wall, thing), rng)
+        _exposed(_drawn(height + drop_m, floor, wall_m, wall, obstacle), rng)
         for height in (HEIGHT_M, HEIGHT_M + BASELINE_M)
     )
     return lower, upper
@@ -133,39 +133,39 @@ def _exposed(grey: np.ndarray, rng: np.random.Generator) -> PaddedPanorama:
 
 
 @lru_cache(maxsize=16)  # most pairs differ in their noise only
-def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing: Thing | None) -> np.ndarray:
+def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, obstacle: Obstacle | None) -> np.ndarray:
     """Return the grey levels of a panorama without noise."""
     columns, rows = np.meshgrid(np.arange(CYLINDER.width), np.arange(CYLINDER.height))
     rays = CYLINDER.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
     with np.errstate(divide="ignore"):
         r = np.where(rays[:, 2] < 0, -height_m / rays[:, 2], np.inf)
-        if isinstance(thing, Slope):
-            slope = math.tan(math.radians(thing.degrees))
+        if isinstance(obstacle, Slope):
+            slope = math.tan(math.radians(obstacle.degrees))
             steeper = slope * rays[:, 0] - rays[:, 2]
-            on_slope = np.where(steeper > 0, (height_m + slope * thing.start_m) / steeper, np.inf)
-            r = np.where(r * rays[:, 0] > thing.start_m, on_slope, r)
+            on_slope = np.where(steeper > 0, (height_m + slope * obstacle.start_m) / steeper, np.inf)
+            r = np.where(r * rays[:, 0] > obstacle.start_m, on_slope, r)
     near = np.minimum(r, wall_m)
     x, y, z = (near * rays.T[i] for i in range(3))
     azimuth = np.arctan2(y, x)
     grey = np.where(r < wall_m, floor(x, y), wall(azimuth, height_m + z))
-    if isinstance(thing, Pole):
-        hidden = (np.abs(azimuth) < thing.width_m / thing.range_m / 2) & (r > thing.range_m)
-        grey = np.where(hidden, thing.grey, grey)
-    elif isinstance(thing, Walls):
-        to_wall_m = thing.aside_m / np.abs(rays[:, 1])
-        of_wall = np.where(height_m + to_wall_m * rays[:, 2] < 0.08, thing.board_grey, thing.grey)
+    if isinstance(obstacle, Pole):
+        hidden = (np.abs(azimuth) < obstacle.width_m / obstacle.range_m / 2) & (r > obstacle.range_m)
+        grey = np.where(hidden, obstacle.grey, grey)
+    elif isinstance(obstacle, Walls):
+        to_wall_m = obstacle.lateral_m / np.abs(rays[:, 1])
+        of_wall = np.where(height_m + to_wall_m * rays[:, 2] < 0.08, obstacle.board_grey, obstacle.grey)
         grey = np.where(to_wall_m < near, of_wall, grey)
-    elif isinstance(thing, Bar):
-        height = height_m + thing.range_m * rays[:, 2]
-        grey = np.where((height > thing.heights_m[0]) & (height < thing.heights_m[1]), thing.grey, grey)
-    elif isinstance(thing, Block):
-        at_front_m = height_m + thing.range_m * rays[:, 2]
-        on_top_m = r * (1 - thing.height_m / height_m)
-        is_top = (on_top_m > thing.range_m) & (on_top_m < thing.range_m + thing.depth_m)
-        is_front = (at_front_m > 0) & (at_front_m < thing.height_m)
-        shown: float | np.ndarray = thing.grey
-        if thing.pattern is not None:
-            along_m = np.where(is_front, thing.range_m - at_front_m, np.minimum(on_top_m, wall_m))  # over its edge
-            shown = thing.pattern(along_m * np.cos(azimuth), along_m * np.sin(azimuth))
+    elif isinstance(obstacle, Bar):
+        height = height_m + obstacle.range_m * rays[:, 2]
+        grey = np.where((height > obstacle.heights_m[0]) & (height < obstacle.heights_m[1]), obstacle.grey, grey)
+    elif isinstance(obstacle, Block):
+        at_front_m = height_m + obstacle.range_m * rays[:, 2]
+        on_top_m = r * (1 - obstacle.height_m / height_m)
+        is_top = (on_top_m > obstacle.range_m) & (on_top_m < obstacle.range_m + obstacle.depth_m)
+        is_front = (at_front_m > 0) & (at_front_m < obstacle.height_m)
+        shown: float | np.ndarray = obstacle.grey
+        if obstacle.pattern is not None:
+            along_m = np.where(is_front, obstacle.range_m - at_front_m, np.minimum(on_top_m, wall_m))  # over its edge
+            shown = obstacle.pattern(along_m * np.cos(azimuth), along_m * np.sin(azimuth))
         grey = np.where(is_top | is_front, shown, grey)
     return np.asarray(grey.reshape(columns.shape))

@@ -19,10 +19,10 @@ from tests.omnid.core.obstacles.drawn_floor import (
     T_RECT_BASE,
     Bar,
     Block,
+    Obstacle,
     Pattern,
     Pole,
     Slope,
-    Thing,
     Walls,
     panoramas,
     plain,
@@ -38,7 +38,7 @@ AHEAD, BEHIND = np.abs(azimuths()) < math.radians(1.5), np.abs(azimuths()) > mat
 SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)
 
 
-class Standing:
+class BaseAtRest:
     """A base at rest, in the middle of a round room."""
 
     def __init__(self, floor: Pattern, visible: np.ndarray = SHOWN, ahead_m: float = 0.0) -> None:
@@ -49,7 +49,7 @@ class Standing:
 
     def scan(
         self,
-        thing: Thing | None = None,
+        obstacle: Obstacle | None = None,
         *,
         pairs: int = 1,
         wall_m: float = WALL_M,
@@ -59,7 +59,7 @@ class Standing:
     ) -> GridScan:
         """Return the scan after some more pairs."""
         for _ in range(pairs):
-            lower, upper = panoramas(self.floor, wall_m, wall, drop_m, thing, seed=self.seq)
+            lower, upper = panoramas(self.floor, wall_m, wall, drop_m, obstacle, seed=self.seq)
             scan = self.scans.add(self.seq * PERIOD_NS, np.eye(4), lower, upper, lost)
             self.seq += 1
         assert scan is not None
@@ -69,7 +69,7 @@ class Standing:
 @pytest.mark.parametrize("floor", [plain, worn, stains, worn_with_line])
 def test_floor_is_free_up_to_the_wall_whatever_it_shows(floor: Pattern) -> None:
     """A plain floor shows nothing, and no edge at which something could begin; a painted line is a mark."""
-    scan = Standing(floor).scan(pairs=PAIRS)
+    scan = BaseAtRest(floor).scan(pairs=PAIRS)
     assert np.median(scan.free_m) > 0.75 * WALL_M and (scan.free_m < WALL_M + 0.1).all()
 
 
@@ -78,7 +78,7 @@ class Case:
     """Something ahead."""
 
     floor: Pattern
-    thing: Pole | Bar
+    obstacle: Pole | Bar
 
 
 @pytest.mark.hazard("H19")
@@ -98,26 +98,26 @@ class Case:
 )
 def test_floor_behind_a_plain_thing_is_not_free(case: Case) -> None:
     """What begins nearer than the floor in view shows no foot, and may stand anywhere before what it hides."""
-    scan = Standing(case.floor).scan(case.thing, pairs=PAIRS)
-    assert scan.free_m[AHEAD].max() < max(case.thing.range_m, 0.3) + 0.15
-    if isinstance(case.thing, Pole):
+    scan = BaseAtRest(case.floor).scan(case.obstacle, pairs=PAIRS)
+    assert scan.free_m[AHEAD].max() < max(case.obstacle.range_m, 0.3) + 0.15
+    if isinstance(case.obstacle, Pole):
         assert np.median(scan.free_m[BEHIND]) > 0.75 * WALL_M
 
 
-@pytest.mark.parametrize("aside_m", [0.4, 0.5])
-def test_a_base_may_begin_between_walls_nearer_than_the_floor_in_view(aside_m: float) -> None:
+@pytest.mark.parametrize("lateral_m", [0.4, 0.5])
+def test_a_base_may_begin_between_walls_nearer_than_the_floor_in_view(lateral_m: float) -> None:
     """What hides the nearest floor there goes on as a wall in view; it may stand anywhere only where it does not."""
-    free_m = Standing(worn).scan(Walls(aside_m), pairs=PAIRS).free_m
+    free_m = BaseAtRest(worn).scan(Walls(lateral_m), pairs=PAIRS).free_m
     assert free_m[AHEAD].min() > 2.0 and free_m[BEHIND & (np.abs(azimuths()) > math.radians(178))].min() > 2.0
-    aside = np.abs(np.abs(azimuths()) - math.radians(60)) < math.radians(10)
-    to_wall_m = aside_m / np.sin(np.abs(azimuths()[aside]))
-    assert (np.abs(free_m[aside] - to_wall_m) < 3 * CELL_M).mean() > 0.9
+    sideways = np.abs(np.abs(azimuths()) - math.radians(60)) < math.radians(10)
+    to_wall_m = lateral_m / np.sin(np.abs(azimuths()[sideways]))
+    assert (np.abs(free_m[sideways] - to_wall_m) < 3 * CELL_M).mean() > 0.9
 
 
 @pytest.mark.parametrize("floor", [plain, worn, stains])
 def test_a_hanging_bar_is_where_it_is_seen(floor: Pattern) -> None:
     """Cells around it, to which its evidence belongs as well, stay free."""
-    scan = Standing(floor).scan(Bar(1.4, (0.5, 0.56)), pairs=20)
+    scan = BaseAtRest(floor).scan(Bar(1.4, (0.5, 0.56)), pairs=20)
     assert scan.grid is not None
     cells = np.argwhere(scan.grid.states == OCCUPIED)[:, ::-1] + 0.5
     ranges_m = np.linalg.norm(scan.grid.corner_m + CELL_M * cells, axis=1)
@@ -129,14 +129,14 @@ def test_a_hanging_bar_is_where_it_is_seen(floor: Pattern) -> None:
 @pytest.mark.parametrize("floor", [worn, stains])
 def test_something_low_begins_at_its_front(floor: Pattern) -> None:
     """Over its top, which shows nothing, the floor behind is seen: its end alone is a surface."""
-    scan = Standing(floor).scan(Block(1.4, 0.4, 0.1), pairs=PAIRS)
+    scan = BaseAtRest(floor).scan(Block(1.4, 0.4, 0.1), pairs=PAIRS)
     assert np.median(scan.free_m) > 1.2 and np.quantile(scan.free_m, 0.98) < 1.5
 
 
 @pytest.mark.hazard("H19")
 def test_a_surface_nearer_than_the_floor_in_view_ends_the_way() -> None:
     """Its top, which looks like the floor, hides the nearest floor in view, and ends beyond."""
-    scan = Standing(stains).scan(Block(0.7, 0.4, 0.5, pattern=stains), pairs=PAIRS)
+    scan = BaseAtRest(stains).scan(Block(0.7, 0.4, 0.5, pattern=stains), pairs=PAIRS)
     assert scan.free_m.max() < 0.85
 
 
@@ -144,7 +144,7 @@ def test_a_surface_nearer_than_the_floor_in_view_ends_the_way() -> None:
 def test_floor_behind_a_white_wall_is_not_free() -> None:
     """It shows nothing itself but its foot."""
     wall = lambda azimuth, height_m: np.full(np.shape(azimuth), 200.0)  # noqa: E731
-    scan = Standing(worn).scan(pairs=PAIRS, wall_m=1.8, wall=wall)
+    scan = BaseAtRest(worn).scan(pairs=PAIRS, wall_m=1.8, wall=wall)
     assert np.median(scan.free_m) > 1.2 and scan.free_m.max() < 1.9
 
 
@@ -152,7 +152,7 @@ def test_floor_behind_a_white_wall_is_not_free() -> None:
 @pytest.mark.parametrize("floor", [plain, worn])
 def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Pattern) -> None:
     """It is known in 1.5 s, also by a base at rest, and a second after it has gone the floor is free again."""
-    base = Standing(floor)
+    base = BaseAtRest(floor)
     base.scan(pairs=8)
     assert base.scan(Pole(1.5, 0.08), pairs=15).free_m[AHEAD].min() < 1.65
     assert np.median(base.scan(pairs=12).free_m[AHEAD]) > 0.75 * WALL_M
@@ -163,7 +163,7 @@ def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Patte
 @pytest.mark.parametrize("ahead_m", [0.0, 0.3])
 def test_a_person_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern, ahead_m: float) -> None:
     """As wide as a person, and where the cameras see it; nothing else has come."""
-    base = Standing(floor, ahead_m=ahead_m)
+    base = BaseAtRest(floor, ahead_m=ahead_m)
     assert np.isnan(base.scan(pairs=8).arrivals.ranges_m).all()
     found = [base.scan(Pole(1.5, 0.4, 60.0)).arrivals.ranges_m for _ in range(2)]
     came = np.isfinite(found).any(axis=0)
@@ -174,7 +174,7 @@ def test_a_person_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern
 
 @pytest.mark.hazard("H17")
 def test_an_obstacle_that_hides_the_nearest_floor_in_view_may_be_nearer() -> None:
-    base = Standing(stains)
+    base = BaseAtRest(stains)
     base.scan(pairs=8)
     scan = base.scan(Pole(0.5, 0.4, 60.0))
     assert scan.arrivals.is_nearer[AHEAD].all() and scan.free_m[AHEAD].max() < 0.7
@@ -183,7 +183,7 @@ def test_an_obstacle_that_hides_the_nearest_floor_in_view_may_be_nearer() -> Non
 @pytest.mark.hazard("H19")
 def test_nothing_is_free_a_while_after_all_images_are_lost() -> None:
     """Somebody may have come from where nothing was known, at 1.6 m/s."""
-    base = Standing(stains)
+    base = BaseAtRest(stains)
     assert np.median(base.scan(pairs=PAIRS).free_m) > 0.75 * WALL_M
     assert base.scan(pairs=25, lost=SHOWN).free_m.max() < 0.5
     assert np.median(base.scan(pairs=PAIRS).free_m) > 0.6 * WALL_M
@@ -192,7 +192,7 @@ def test_nothing_is_free_a_while_after_all_images_are_lost() -> None:
 @pytest.mark.parametrize("degrees", [3.0, 6.0, 9.0])
 def test_a_ramp_is_free(degrees: float) -> None:
     """It is a second plane of the floor, from where it begins on."""
-    scan = Standing(stains).scan(Slope(1.4, degrees), pairs=3 * PAIRS)
+    scan = BaseAtRest(stains).scan(Slope(1.4, degrees), pairs=3 * PAIRS)
     assert np.median(scan.free_m[AHEAD]) > 2.2
     assert np.median(scan.free_m[BEHIND]) > 0.75 * WALL_M and scan.free_m.max() < WALL_M + 0.1
 
@@ -200,13 +200,13 @@ def test_a_ramp_is_free(degrees: float) -> None:
 @pytest.mark.hazard("H19")
 @pytest.mark.parametrize("degrees", [14.0, 20.0])
 def test_a_slope_that_is_too_steep_is_not_free(degrees: float) -> None:
-    assert Standing(stains).scan(Slope(1.4, degrees), pairs=3 * PAIRS).free_m[AHEAD].max() < 1.8
+    assert BaseAtRest(stains).scan(Slope(1.4, degrees), pairs=3 * PAIRS).free_m[AHEAD].max() < 1.8
 
 
 @pytest.mark.parametrize("drop_m", [0.12, -0.12])
 def test_floor_at_another_height_is_not_free(drop_m: float) -> None:
     """The base states a floor that the images show lower or higher, all around: it ends where it is in view."""
-    assert np.median(Standing(stains).scan(pairs=PAIRS, drop_m=drop_m).free_m) < 0.95
+    assert np.median(BaseAtRest(stains).scan(pairs=PAIRS, drop_m=drop_m).free_m) < 0.95
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
@@ -214,7 +214,7 @@ def test_what_is_not_in_view_is_not_free(is_lost: bool) -> None:
     """A quarter of the turn is masked, or its tiles are dead."""
     visible, middle = SHOWN.copy(), CYLINDER.width // 2
     visible[:, middle - CYLINDER.width // 8 : middle + CYLINDER.width // 8] = False
-    base = Standing(plain) if is_lost else Standing(plain, visible)
+    base = BaseAtRest(plain) if is_lost else BaseAtRest(plain, visible)
     scan = base.scan(pairs=PAIRS, lost=~visible if is_lost else None)
     assert scan.free_m[np.abs(azimuths()) < math.radians(35)].max() < 0.4
 
@@ -223,5 +223,5 @@ def test_without_floor_in_view_nothing_is_free() -> None:
     """All rows below the horizon are masked."""
     visible = SHOWN.copy()
     visible[round(CYLINDER.row0) + 5 :] = False
-    scans = Standing(plain, visible).scans
+    scans = BaseAtRest(plain, visible).scans
     assert scans.add(0, np.eye(4), *panoramas(plain, WALL_M, striped), None) is None

@@ -43,7 +43,7 @@ def driven(cameras: RenderedCameras, poses: Array, speed_mps: float | None = Non
 
 
 @pytest.fixture(scope="module")
-def alike() -> RenderedCameras:
+def repeated() -> RenderedCameras:
     return RenderedCameras.of(make_rig(size=256), repeating(1, 40.0, PERIOD_M))
 
 
@@ -51,10 +51,10 @@ def ahead(steps: int, step_m: float) -> Array:
     return planar_poses(np.column_stack([step_m * np.arange(steps + 1), np.zeros(steps + 1)]), np.zeros(steps + 1))
 
 
-def test_a_world_that_repeats_is_degraded_and_the_covariance_covers_all_motions(alike: RenderedCameras) -> None:
+def test_a_world_that_repeats_is_degraded_and_the_covariance_covers_all_motions(repeated: RenderedCameras) -> None:
     """Steps of nearly one period look like small ones back: the pose is wrong, and says so."""
     poses = ahead(6, STEP_M)
-    found = driven(alike, poses)[1:]
+    found = driven(repeated, poses)[1:]
     for k, estimate in enumerate(found, 1):
         error = se3.log(se3.inverse(se3.inverse(poses[0]) @ poses[k]) @ estimate.T_odom_rect)[:3]
         assert estimate.state is TrackingState.DEGRADED, k
@@ -62,9 +62,9 @@ def test_a_world_that_repeats_is_degraded_and_the_covariance_covers_all_motions(
         assert abs(error[0]) > 0.9 * PERIOD_M, "this world is to mislead"
 
 
-def test_wheels_decide_between_two_motions(alike: RenderedCameras) -> None:
+def test_wheels_decide_between_two_motions(repeated: RenderedCameras) -> None:
     poses = ahead(4, STEP_M)
-    for k, estimate in enumerate(driven(alike, poses, STEP_M / PERIOD_S)):
+    for k, estimate in enumerate(driven(repeated, poses, STEP_M / PERIOD_S)):
         assert estimate.state is TrackingState.TRACKING, k
         assert motion_errors(estimate.T_odom_rect, se3.inverse(poses[0]) @ poses[k])[0] < 0.01, k
         assert estimate.covariance[0, 0] < 0.02**2, k

@@ -31,7 +31,7 @@ PATH = planar_poses(
 
 
 def truth(k: int) -> Array:
-    """T_odom_rect at pair k."""
+    """Return T_odom_rect at pair k."""
     return np.asarray(se3.inverse(PATH[0]) @ PATH[k])
 
 
@@ -137,14 +137,7 @@ def test_a_long_darkness_is_lost_and_ends_with_relocalisation(
 ) -> None:
     run(odometry, frames[:4])
     dark = run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
-    assert [estimate.state for estimate in dark] == [
-        TrackingState.DEGRADED,
-        TrackingState.DEGRADED,
-        TrackingState.LOST,
-        TrackingState.LOST,
-        TrackingState.LOST,
-        TrackingState.LOST,
-    ]
+    assert [estimate.state for estimate in dark] == [TrackingState.DEGRADED] * 2 + [TrackingState.LOST] * 4
     assert (np.diff([np.trace(estimate.covariance) for estimate in dark]) > 0).all()
     steps = np.linalg.norm(np.diff([estimate.T_odom_rect[:3, 3] for estimate in dark], axis=0), axis=1)
     assert (np.diff(steps) < 0).all() and steps[-1] < 0.02  # slowing down
@@ -155,8 +148,8 @@ def test_a_long_darkness_is_lost_and_ends_with_relocalisation(
     assert (back[-1].state, back[-1].resets) == (TrackingState.TRACKING, 0)
 
 
-def test_relocalises_at_a_keyframe_where_tracking_finds_nothing(cameras: RenderedCameras) -> None:
-    """A tracker that reaches a pixel far does not find the way back; the keyframe tells it, and the gap is closed."""
+def test_odometry_relocalises_at_a_keyframe_where_tracking_finds_nothing(cameras: RenderedCameras) -> None:
+    """A tracker that reaches a pixel far does not find the way back; a keyframe does, and the gap is closed."""
     odometry = VisualOdometry(
         cameras.model, KltSettings(iterations=1, levels=0), OdometryLimits(), Relocaliser(cameras.model)
     )
@@ -171,7 +164,7 @@ def test_relocalises_at_a_keyframe_where_tracking_finds_nothing(cameras: Rendere
 
 
 def test_odom_does_not_jump_to_a_keyframe_far_from_the_predicted_pose(cameras: RenderedCameras) -> None:
-    """Carried in the dark: the place is known, but odom goes on, the reset counter tells it, and so does sigma."""
+    """Carried in the dark: the place is known, but odom goes on, with a higher reset counter and a larger sigma."""
     path = planar_poses(np.array([[0.25 * k, 0] for k in range(6)]), np.zeros(6))
     odometry = visual_odometry(cameras.model, OdometryLimits(keyframes=2))
     run(odometry, [cameras.frame(k, T) for k, T in enumerate(path)])
@@ -200,7 +193,7 @@ def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(
     assert there[3].state == TrackingState.LOST
     assert [estimate.resets for estimate in there[restarted:]] == [1] * (12 - restarted)
     assert all(estimate.state == TrackingState.TRACKING for estimate in there[restarted + 1 :])
-    # Standing at a corner of that corridor, it moves there as it does here; the gap stays in the covariance.
+    # The robot moves in that corridor as it does in this one; the gap stays in the covariance.
     moved = se3.inverse(there[-2].T_odom_rect) @ there[-1].T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[2]) @ PATH[3])[0] < 5e-3
     assert np.sqrt(there[-1].covariance[0, 0]) > 0.1 > 10 * np.sqrt(before.covariance[0, 0])

@@ -8,12 +8,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.plane_patches import (
-    align,
-    fitted_slopes,
-    plane_maps,
-    plane_templates,
-)
+from omnid.core.odometry.plane_patches import align, fitted_slopes, plane_maps, plane_templates
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel

@@ -19,7 +19,7 @@ from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of
 
 
 def keyframe(number: int, features: int = 10) -> PlaceKeyframe:
-    """A keyframe with random evidence."""
+    """Return a keyframe that has seen nothing."""
     return PlaceKeyframe(
         number,
         0,
@@ -34,24 +34,24 @@ def keyframe(number: int, features: int = 10) -> PlaceKeyframe:
 
 
 def bent_way(number: float) -> np.ndarray:
-    """A pose on a bent path."""
+    """Return a pose on a bent path."""
     return se3.exp([number, 0.3 * number, 0, 0, 0, 0.1 * number])
 
 
 def link(a: int, b: int, inliers: int = 0) -> Link:
-    """The exact edge between two keyframes."""
+    """Return the exact edge between two keyframes."""
     return Link(a, b, se3.inverse(bent_way(a)) @ bent_way(b), 1e-4 * np.eye(6), inliers)
 
 
 def chain(count: int, **bounds: int) -> PlaceMap:
-    """Keyframes one after the other."""
+    """Return a map of keyframes one after the other."""
     places = PlaceMap(**bounds)
     for number in range(count):
         places.add(keyframe(number), bent_way(number), link(number - 1, number) if number else None)
     return places
 
 
-def test_a_full_map_drops_what_others_are_nearest_to() -> None:
+def test_a_full_map_drops_the_keyframe_that_is_nearest_to_others() -> None:
     places = PlaceMap(max_keyframes=4)
     for number, x in enumerate((0.0, 1.0, 1.1, 2.0, 3.0)):
         places.add(keyframe(number), bent_way(x))

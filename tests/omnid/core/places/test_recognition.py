@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.local_map import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.features import (
-    describe,
-    describe_patches,
-    thumbnail,
-)
+from omnid.core.places.features import describe, describe_patches, thumbnail
 from omnid.core.places.place_map import PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Expected, PlaceSearch, Relocaliser, recognise
 from tests.omnid.core.scenery import RenderedCameras, motion_errors, texture, wrapped

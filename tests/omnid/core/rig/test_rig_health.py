@@ -95,7 +95,7 @@ def turned(rooms: Path) -> Turned:
 
 
 def drive(health: RigHealth, panoramas: Iterable[Panoramas], apart_m: float = 1.0) -> RigHealth:
-    """Return the state after these views of a drive, PERIOD_S and so far apart."""
+    """Return the state after these views of a drive, PERIOD_S and apart_m apart."""
     for number, one in enumerate(panoramas):
         stamped = replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS))
         health.check_drive(stamped, np.array([number * apart_m, 0.0, 0.0]))
@@ -130,7 +130,7 @@ def test_half_a_degree_is_a_warning(turned: Turned, turn_deg: tuple[float, float
     assert np.rad2deg(monitor.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
 
 
-def test_a_robot_that_stands_gets_no_finding(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
+def test_a_robot_at_rest_gets_no_finding(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
     health = driven(place, true[1][:1] * 100, 0.0)
     status = entry(RIG, rig_stats(health))
     assert (status.level, status.message, len(health.views)) == (0, "unchecked", 1)

@@ -9,18 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.photometry import (
-    pair_gains,
-)
-from omnid.core.stereo.tiles import (
-    ALL_LIVE,
-    IN_A_ROW,
-    SIDES,
-    Side,
-    TileMonitor,
-    TileStates,
-    TileSums,
-)
+from omnid.core.stereo.photometry import pair_gains
+from omnid.core.stereo.tiles import ALL_LIVE, IN_A_ROW, SIDES, Side, TileMonitor, TileStates, TileSums
 from tests.omnid.core.scenery import texture
 
 Image = NDArray[np.uint8]
@@ -91,7 +81,7 @@ def plain_part(scene: Image) -> Image:
 @pytest.mark.parametrize(
     "changed", [lambda scene: scene, lambda scene: scene // 9, plain_part], ids=["", "dim", "plain"]
 )
-def test_a_scene_that_stands_is_live_by_its_noise(changed: Callable[[Image], Image]) -> None:
+def test_a_scene_at_rest_is_live_by_its_noise(changed: Callable[[Image], Image]) -> None:
     """Noise of the sensor differs from image to image; a dim scene shows more than noise."""
     cameras = Cameras()
     cameras.scene = changed(cameras.scene)
@@ -99,7 +89,7 @@ def test_a_scene_that_stands_is_live_by_its_noise(changed: Callable[[Image], Ima
 
 
 def test_without_noise_a_scene_in_which_a_little_moves_is_live() -> None:
-    """Images of a simulator, or of a camera that removes noise: the base stands, somebody walks."""
+    """Images of a simulator, or of a camera that removes noise: the base is at rest, somebody walks."""
     cameras = Cameras(noise_grey=0.0)
     for number in range(6):
         images = cameras.images()

@@ -8,11 +8,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.paper.paper_odometry import (
-    UNKNOWN_SPEED_SIGMA,
-    PaperOdometry,
-    turned_track,
-)
+from omnid.core.odometry.paper.paper_odometry import UNKNOWN_SPEED_SIGMA, PaperOdometry, turned_track
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.tracking_state import TrackingState
@@ -25,8 +21,8 @@ PATH = planar_poses(
 
 
 def image(panorama: NDArray[np.uint8], seq: int = 0) -> StereoFrame:
-    nothing = np.full(panorama.shape, np.nan, np.float32)
-    return StereoFrame(seq, wrapped(panorama), wrapped(panorama), nothing, np.ones(panorama.shape, bool))
+    no_disparity = np.full(panorama.shape, np.nan, np.float32)
+    return StereoFrame(seq, wrapped(panorama), wrapped(panorama), no_disparity, np.ones(panorama.shape, bool))
 
 
 @pytest.mark.parametrize("degrees", [0.0, 26.0, -45.0, 94.0, 180.0])
@@ -45,7 +41,7 @@ def frames(cameras: RenderedCameras) -> list[StereoFrame]:
     return [cameras.frame(k, T) for k, T in enumerate(PATH)]
 
 
-def test_a_path_through_a_right_angle(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
+def test_a_path_through_a_right_angle_is_estimated(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
     odometry = PaperOdometry(cameras.model, KltSettings())
     for k, frame in enumerate(frames):
         estimate = odometry.process(frame, 0.1 if k else 0.0)
@@ -57,7 +53,9 @@ def test_a_path_through_a_right_angle(cameras: RenderedCameras, frames: list[Ste
 
 
 @pytest.mark.parametrize("tracker", ["improved", "klt"])
-def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: list[StereoFrame], tracker: str) -> None:
+def test_the_pose_is_lost_in_darkness_and_kept(
+    cameras: RenderedCameras, frames: list[StereoFrame], tracker: str
+) -> None:
     odometry = PaperOdometry(cameras.model, KltSettings(), tracker)
     odometry.process(frames[0], 0.0)
     before = odometry.process(frames[1], 0.1)
@@ -66,7 +64,7 @@ def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: l
         assert estimate.state == TrackingState.LOST
         np.testing.assert_array_equal(estimate.T_odom_rect, before.T_odom_rect)
     assert np.trace(out.covariance) > np.trace(into.covariance) > np.trace(before.covariance)
-    # The motion in the gap is not known: odom goes on from another place, which its sigma says.
+    # The motion in the gap is not known: odom goes on from another place, within its sigma.
     again = odometry.process(frames[2], 0.1)
     assert (again.state, again.resets) == (TrackingState.DEGRADED, 1)
     np.testing.assert_allclose(np.sqrt(again.covariance[0, 0]), UNKNOWN_SPEED_SIGMA * 0.2, rtol=0.05)
