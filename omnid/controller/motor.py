@@ -43,7 +43,7 @@ class MotorSettings:
 def open_motor(config: MotorSettings, closing: ExitStack, *, waits: bool = True) -> MotorDriver:
     """Return the driver of the configured port, or of a simulated motor controller where the port is "simulated".
 
-    closing closes it. waits: for an answer, and DriverError where there is none; otherwise `send` asks for it.
+    closing: closes the driver. waits: for an answer, and DriverError where there is none; otherwise `send` asks for it.
     DriverError for a watchdog so short that one or two late ticks would let it expire.
     """
     # Settings are read where no device is opened, so that only this function loads the drivers.

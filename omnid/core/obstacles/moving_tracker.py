@@ -52,8 +52,8 @@ ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person
 SIGMA_M: Final = 0.06  # least sigma of a cluster's middle, because its visible side changes
 PERSON_M: Final = 0.4  # width of a person, because the rest of a narrower cluster may be on either side
 START_MPS: Final = 1.0  # sigma of the velocity of a new track
-LEAST_MPS: Final = 0.2  # least speed of a moving obstacle,
-SPEED_SIGMAS: Final = 1.5  # and the sigmas by which it must exceed its noise
+LEAST_MPS: Final = 0.2  # least speed of a moving obstacle
+SPEED_SIGMAS: Final = 1.5  # least speed of a moving obstacle in sigmas of that speed
 # Pairs after which an object is new no longer: until then it counts as moving at any speed, as it was not there before.
 NEW_UPDATES: Final = 3
 FORGOTTEN_S: Final = 0.9  # A track without a cluster ends after this time.

@@ -52,7 +52,7 @@ def unpaired(pair: Synchronise) -> tuple[int, int]:
     return pair.stats()["unpaired_lower"], pair.stats()["unpaired_upper"]
 
 
-def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:
+def test_all_frames_are_paired_in_any_order_of_arrival(pair: Synchronise) -> None:
     """Frames of one camera arrive up to three periods later than those of the other."""
     rng, order = random.Random(5), []
     for camera in ("lower", "upper"):
@@ -75,7 +75,7 @@ def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:
         ([("upper", 0), ("upper", 100), ("lower", 101), ("lower", 200)], [101], (1, 1)),
     ],
 )
-def test_pairs_frames_in_the_order_of_their_stamps(
+def test_frames_are_paired_in_the_order_of_their_stamps(
     pair: Synchronise, order: list[tuple[Camera, int]], stamps: list[int], expected: tuple[int, int]
 ) -> None:
     found = made(pair, *(Frame(0, stamp_ms * MS, camera, "jpeg", JPEG) for camera, stamp_ms in order))
@@ -184,7 +184,7 @@ def jitter(sigma_ms: float, count: int) -> np.ndarray:
         ([14.0] * 40 + [-19.0], -19.0, 0.0),
     ],
 )
-def test_the_time_between_the_exposures_of_a_pair(
+def test_the_time_between_the_exposures_of_a_pair_is_found(
     skews_ms: Iterable[float], expected_ms: float, within_ms: float
 ) -> None:
     skew = Skew()

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 PERIOD_S = 0.1
 PATH = planar_poses(np.array([[0.05 * k, 0] for k in range(24)]), np.zeros(24))
-AHEAD, STANDS, GYRO = WheelSample(0, 0.5, 0.0), WheelSample(0, 0.0, 0.0), GyroSample(0, 0.0, 0.0, 0.0)
+AHEAD, AT_REST, GYRO = WheelSample(0, 0.5, 0.0), WheelSample(0, 0.0, 0.0), GyroSample(0, 0.0, 0.0, 0.0)
 SOON = OdometryLimits(restart_s=0.25)  # four frames: each one of another place costs a search through all turns
 DEGRADED, LOST, TRACKING = TrackingState.DEGRADED, TrackingState.LOST, TrackingState.TRACKING
 
@@ -68,7 +68,7 @@ def test_wheels_carry_the_pose_through_the_dark(cameras: RenderedCameras) -> Non
     assert motion_errors(found[-1].T_odom_rect, along(15))[0] < 5e-3
     np.testing.assert_allclose(found[-1].velocity[0], 0.5, atol=0.02)
     sigma_m = np.sqrt([estimate.covariance[0, 0] for estimate in found])
-    # Errors that all steps share add up: so much a step, and not its root.
+    # Errors that all steps share add up: sigma grows with the number of steps, and not with its root.
     growth_m = sigma_m[11] / sigma_m[2]
     assert (np.diff(sigma_m) > 0).all() and 2.5 < growth_m < 4.5 and sigma_m[-1] < 0.02
     light = robot.see(cameras.frame(50, PATH[16]), AHEAD)
@@ -113,17 +113,17 @@ def elsewhere(robot: Robot, cameras: RenderedCameras, sample: MotionSample) -> l
     return [robot.see(there.frame(200 + k, PATH[10]), sample) for k in range(6)]
 
 
-def test_a_base_that_is_carried_away_while_its_wheels_stand_begins_again(cameras: RenderedCameras) -> None:
+def test_a_base_that_is_carried_away_while_its_wheels_rest_begins_again(cameras: RenderedCameras) -> None:
     """The wheels say that the map is in view, and the images that it is not: the way is not known."""
     robot = Robot(cameras, SOON)
-    robot.dark(cameras, 6, STANDS)
-    there = elsewhere(robot, cameras, STANDS)
+    robot.dark(cameras, 6, AT_REST)
+    there = elsewhere(robot, cameras, AT_REST)
     assert [(one.state, one.resets) for one in there[-4:]] == [(DEGRADED, 0), (DEGRADED, 1), *[(TRACKING, 1)] * 2]
     assert np.sqrt(there[-1].covariance[0, 0]) > 0.5
     # In its own place it goes on as before.
     robot = Robot(cameras, SOON)
-    robot.dark(cameras, 6, STANDS)
-    back = [robot.see(cameras.frame(60 + k, PATH[3]), STANDS) for k in range(2)]
+    robot.dark(cameras, 6, AT_REST)
+    back = [robot.see(cameras.frame(60 + k, PATH[3]), AT_REST) for k in range(2)]
     assert (back[-1].state, back[-1].resets) == (TRACKING, 0) and np.sqrt(back[-1].covariance[0, 0]) < 5e-3
 
 
