@@ -1,4 +1,4 @@
-"""TCP ports that are free, and such that are taken."""
+"""TCP ports that are free."""
 
 from __future__ import annotations
 

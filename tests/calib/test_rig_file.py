@@ -38,7 +38,7 @@ def assert_same(a: MountedCamera, b: MountedCamera) -> None:
 
 
 @pytest.mark.parametrize("masks", [False, True])
-def test_rig_round_trip(rig: Rig, masks: bool, tmp_path: Path) -> None:
+def test_a_rig_that_is_written_is_read_exactly(rig: Rig, masks: bool, tmp_path: Path) -> None:
     rig = with_masks(rig) if masks else rig
     write_rig(tmp_path / "rig.toml", rig)
     for found in (read_rig(str(tmp_path / "rig.toml")), parse_rig(rig_toml(rig)), parse_rig(rig_toml(rig).encode())):
@@ -59,7 +59,7 @@ def test_a_pose_on_the_robot_that_is_not_stated_is_left_out_and_one_without_a_he
     assert shifted.height_m(floor_m=-1.2) == pytest.approx(1.2)
 
 
-def test_file_contains_the_camera_poses(omni_rig: Rig, around: Array) -> None:
+def test_the_file_contains_the_camera_poses(omni_rig: Rig, around: Array) -> None:
     """A round trip does not detect T_rig_upper written as its inverse; a transformed point does."""
     import tomllib
 
@@ -142,7 +142,7 @@ def random_matrix(count: int) -> Array:
     return np.asarray(factor @ factor.T)
 
 
-def test_round_trip_is_exact(rig: Rig) -> None:
+def test_a_covariance_that_is_written_is_read_exactly(rig: Rig) -> None:
     names = names_of(rig)
     matrix = random_matrix(len(names))
     text = rig_toml(replace(rig, covariance=RigCovariance.of_matrix(names, matrix)))

@@ -33,8 +33,8 @@ class VoxelMap:
     """Voxels in arrays that are sorted by their keys, of 52 bytes a voxel.
 
     Each voxel keeps the mean position weighted by information (1 / variance), its sum of weights, the number of frames
-    that saw it and the last of them. Points are not mapped that are not finite, of no valid
-    variance, or outside +-2^20 voxels.
+    that saw it and the last of them. Points are left out that are not finite, have no valid variance, or lie outside
+    +-2^20 voxels.
     """
 
     def __init__(self, voxel_m: float = 0.05, max_voxels: int = 180_000) -> None:

@@ -75,7 +75,7 @@ def test_a_real_log_gives_every_frame_in_order(name: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("little_endian", [True, False])
-def test_raw_images_by_the_names_of_cv_bridge(tmp_path: Path, little_endian: bool) -> None:
+def test_raw_images_with_the_names_of_cv_bridge_are_decoded(tmp_path: Path, little_endian: bool) -> None:
     pixels = np.random.default_rng(2).integers(0, 256, (9, 14, 3), np.uint8)
     data = image_message(START_NS, "8UC3", pixels, little_endian=little_endian)
     frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/cam/top", "/cam/bottom")]))
@@ -150,7 +150,7 @@ def test_cameras_are_identified_by_name(tmp_path: Path, lower: str, upper: str) 
     assert [frame.camera for frame in reader.frames()] == ["lower", "upper"] * 2
 
 
-def test_requested_topics(tmp_path: Path) -> None:
+def test_requested_topics_are_read(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(2, "/a", "/b"))
     with pytest.raises(DriverError, match=r"found /a, /b; give --lower and --upper"):
         LogReader(path)

@@ -210,9 +210,6 @@ def test_wheels_that_are_limited_by_their_driver_follow_the_commands(known: bool
     assert (not bench.controller.state.stops and not slowed) == known
 
 
-# The motor of the settings: the simulation of its protocol, and settings that cannot work.
-
-
 # docs/safety.md: each hazard has a test that is marked with it, and each reason to stop says whether it disarms.
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs/safety.md").read_text("utf-8")
