@@ -221,7 +221,7 @@ def test_a_killed_daemon_stops_the_wheels_until_it_is_back(operator: GuestOperat
     assert wheels.state()["unsafe_resumes"] == 0
 
 
-def test_restarts_a_daemon_that_stalls(operator: GuestOperator, wheels: Wheels) -> None:
+def test_a_daemon_that_stalls_is_started_again(operator: GuestOperator, wheels: Wheels) -> None:
     pid = int(show("MainPID"))
     os.kill(pid, signal.SIGSTOP)
     until(lambda: wheels.commanded_mps == 0.0)

@@ -116,8 +116,8 @@ def test_the_map_moves_when_a_loop_moves_its_keyframes() -> None:
 
 def test_the_grid_grows_and_is_bounded() -> None:
     grid = KeyframeGrid(0.05)
-    nothing = grid.draw(of({}, np.zeros((0, 4, 4))), T_BASE_RECT)
-    assert (nothing.cells == UNKNOWN).all()
+    empty = grid.draw(of({}, np.zeros((0, 4, 4))), T_BASE_RECT)
+    assert (empty.cells == UNKNOWN).all()
     far = np.array([PATH[0], pose(3000.0, 4000.0, 0.0) @ PATH[0]])
     found = grid.draw(of({0: SCANS[0], 1: SCANS[0]}, far), T_BASE_RECT)
     assert found.cell_m > 0.05 and found.cells.size <= MAX_LIVE_CELLS
@@ -143,7 +143,7 @@ def arc(range_m: float, degrees: tuple[float, float], heights_m: tuple[float, fl
 
 
 def floor_points(longest_m: float, degrees: tuple[float, float] = (-180, 180), z_m: float = FLOOR_M) -> np.ndarray:
-    """Return points of the floor_points."""
+    """Return points of the floor."""
     rng = np.random.default_rng(2)
     angle, r = np.deg2rad(rng.uniform(*degrees, 60_000)), rng.uniform(0.8, longest_m, 60_000)
     return np.column_stack([r * np.cos(angle), r * np.sin(angle), np.full(60_000, z_m)])
@@ -203,7 +203,7 @@ def row(start: int, count: int) -> Array:
     return np.stack([np.arange(start, start + count) + 0.5, np.zeros(count), np.zeros(count)], axis=1)
 
 
-def test_the_scan_grid_agrees_with_a_dictionary() -> None:
+def test_the_voxel_map_agrees_with_a_dictionary() -> None:
     rng = np.random.default_rng(5)
     voxels = VoxelMap(voxel_m=0.1, max_voxels=4096)
     sums: dict[tuple[int, ...], Array] = {}

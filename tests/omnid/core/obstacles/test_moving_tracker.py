@@ -59,7 +59,7 @@ def test_a_person_who_walks_is_tracked_with_velocity_and_covariance(speed_mps: f
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_what_was_put_down_and_stands_does_not_move(seed: int) -> None:
+def test_an_object_that_was_put_down_does_not_move(seed: int) -> None:
     found = tracked([(1.5, 0.8)] * 25, 0.3, seed)
     assert not any(found[5:])
 
@@ -67,7 +67,7 @@ def test_what_was_put_down_and_stands_does_not_move(seed: int) -> None:
 @pytest.mark.hazard("H17")
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("speed_mps", [0.8, 1.2, 1.6])
-def test_two_looks_tell_who_comes_and_three_how_fast(side: int, speed_mps: float) -> None:
+def test_a_second_pair_shows_that_a_person_comes_and_a_third_how_fast(side: int, speed_mps: float) -> None:
     """Pairs at 10 Hz."""
     path = [(2.0, side * (1.8 - speed_mps * 0.1 * i)) for i in range(3)]
     found = tracked(path, 0.5, period_s=0.1)
@@ -75,7 +75,7 @@ def test_two_looks_tell_who_comes_and_three_how_fast(side: int, speed_mps: float
     assert found[2][0].vy_mps * side == pytest.approx(-speed_mps, rel=0.4)
 
 
-def test_range_of_who_hides_the_nearest_floor_in_view_is_not_taken_for_a_stop() -> None:
+def test_a_person_who_hides_the_nearest_floor_in_view_does_not_seem_to_stop() -> None:
     """The ranges stay at 1 m while the person comes nearer; their sigma says that they are a bound."""
     tracker, rng = MovingTracker(), np.random.default_rng(1)
     for i in range(12):

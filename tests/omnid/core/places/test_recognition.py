@@ -48,7 +48,7 @@ def test_another_light_changes_nothing_and_another_patch_much() -> None:
 
 # One keyframe.
 @pytest.mark.parametrize("other", [1, 2])
-def test_a_place_is_recognised_aside_and_turned(
+def test_a_place_is_recognised_from_the_side_and_turned(
     cameras: RenderedCameras, frames: list[StereoFrame], other: int
 ) -> None:
     there, here = describe(frames[0]), describe(frames[other])
@@ -61,7 +61,7 @@ def test_a_place_is_recognised_aside_and_turned(
     assert sigmas.max() < 0.02
 
 
-# Places that look the same: none is chosen, unless odometry tells which one it is.
+# Places that look the same: none is chosen, unless odometry decides which one it is.
 PERIOD_M = 6.0
 X = np.array([0.6, 0.9, 1.2])  # of the keyframes in one half of the corridor
 QUERY = planar_poses(np.array([[1.0, 0.05]]), np.array([2.0]))[0]
@@ -98,10 +98,10 @@ def test_of_two_equal_places_none_is_recognised(twins: RenderedCameras, places: 
 
 
 @pytest.mark.parametrize("half", [0, 1])
-def test_odometry_tells_which_of_two_equal_places_it_is(
+def test_odometry_decides_which_of_two_equal_places_is_recognised(
     twins: RenderedCameras, places: PlaceMap, query: StereoFrame, half: int
 ) -> None:
-    """None is taken if odometry excludes all places that look like this one."""
+    """None is recognised if odometry excludes all places that look like this one."""
     search, small = PlaceSearch(twins.model), thumbnail(query.lower)
     there = se3.exp([half * PERIOD_M, 0, 0, 0, 0, 0]) @ QUERY
     expected = Expected(there, dict.fromkeys(places.keyframes, 3.0), False)
@@ -120,7 +120,7 @@ def _add(relocaliser: Relocaliser, frame: StereoFrame, T_odom_rect: NDArray[np.f
     relocaliser.add(frame, Keyframe(frame.seq, frame.lower, T_odom_rect, np.diag([1e-3] * 6)))
 
 
-def test_the_pose_beside_a_keyframe_is_found_and_no_other_place_is_taken_for_it(
+def test_the_pose_next_to_a_keyframe_is_found_and_no_pose_at_another_place(
     cameras: RenderedCameras, frames: list[StereoFrame], elsewhere: StereoFrame
 ) -> None:
     relocaliser = Relocaliser(cameras.model)
