@@ -394,8 +394,8 @@ def decode_map(payload: bytes, _: bytes = b"") -> Map:
     message = decoded(payload, GRID_SCHEMA)
     info, T_frame_grid = message.info, _rigid_transform(message.info.origin)
     is_parallel = np.allclose(T_frame_grid[:3, :3], np.eye(3), atol=QUATERNION_TOLERANCE)
-    if message.data.size != info.width * info.height or not (info.resolution > 0 and is_parallel):
-        words = f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes"
+    if message.data.size != info.width * info.height or not (0 < info.resolution < math.inf and is_parallel):
+        words = f"{info.width} x {info.height} cells of a finite, positive size, parallel to the frame's axes"
         raise OmnidError(f"a map of {message.data.size} cells of {info.resolution:g} m: expected {words}")
     cells, corner = message.data.reshape(info.height, info.width), (info.origin.position.x, info.origin.position.y)
     return Map(stamp_of(message.header), message.header.frame_id, cells, float(info.resolution), corner)

@@ -1,4 +1,4 @@
-"""Mutated files against every parser, in a process of limited memory: one clear error or a result, never more.
+"""Mutated files and messages against their parsers, in a process of limited memory: a result, or one clear error.
 
 `python -m tests.bench.faults.hostile_files FORMAT FOLDER FILES SEED` is that process; it prints the files that did not
 hold.

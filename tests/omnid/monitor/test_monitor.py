@@ -230,7 +230,7 @@ def test_a_drive_is_cancelled_when_its_command_is_ended(
     endpoint, asked, cancelled = free_endpoint(), list[str](), list[str]()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
 
-        def take(request: Request) -> None:
+        def execute(request: Request) -> None:
             if request.topic == NAVIGATION_TOPIC:
                 cancelled.append(string_from_cdr(request.payload))
                 bus.answer({request.id: Answer(True, "cancelled")})
@@ -239,7 +239,7 @@ def test_a_drive_is_cancelled_when_its_command_is_ended(
                 bus.answer({request.id: Answer(True, "it drives")})
             asked.append(request.topic)
 
-        bus.subscribe_commands(take)
+        bus.subscribe_commands(execute)
         command = [sys.executable, "-c", HEARS_ALL, *words, "--connect", endpoint]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             wait_until(lambda: len(asked) == 1)
@@ -256,11 +256,11 @@ def test_a_route_that_is_too_short_is_taught_on() -> None:
     endpoint, asked = free_endpoint(), list[str]()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
 
-        def take(request: Request) -> None:
+        def execute(request: Request) -> None:
             asked.append(string_from_cdr(request.payload))
             bus.answer({request.id: Answer(asked != ["teach hall", "finish"], "too short")})
 
-        bus.subscribe_commands(take)
+        bus.subscribe_commands(execute)
         command = [sys.executable, "-c", HEARS_ALL, "route", "teach", "hall", "--connect", endpoint]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdin is not None and process.stdout is not None

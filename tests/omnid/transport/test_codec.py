@@ -144,6 +144,7 @@ def overwritten(offset: int, value: bytes) -> bytes:
         (lambda: odometry(stamp_ns=2**31 * 10**9), "stamp"),
         (lambda: scan_cdr(-1, "base_link", RANGES, SIGMA, (0.0, 6.0)), "stamp"),
         (lambda: moving_cdr(2**31 * 10**9, "odom", []), "stamp"),
+        (lambda: decode_map(codec.grid_cdr(STAMP_NS, "odom", CELLS, math.inf, (0.0, 0.0))), "finite, positive size"),
         (lambda: image_cdr(frame(7, "upper", "bgr8"), -1), "-1 ns"),
         *(
             (lambda data=data: PoseAttachment.from_bytes(data), f"the {len(data)} bytes attached to a pose")
