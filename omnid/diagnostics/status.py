@@ -76,7 +76,7 @@ class RunCounters:
     resets: int  # gaps in the trajectory after which tracking began again
     drops: Mapping[str, int]  # messages lost, by reason; zeros too
     places: Mapping[str, int] = field(default_factory=dict)  # keyframes, loops, refusals; empty without a map of places
-    loss: str = ""  # one line where more than a tenth of the pairs is missing
+    loss: str = ""  # of pair_loss
 
     @property
     def no_pose(self) -> bool:
@@ -105,15 +105,14 @@ def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str
     def listed(counts: Mapping[str, int], zeros: bool = True) -> str:
         return ", ".join(f"{name} {count}" for name, count in counts.items() if count or zeros)
 
-    poses, resets = counters.poses, counters.resets
     found = {
         "pairs": str(counters.pairs),
-        "poses": str(poses),
+        "poses": str(counters.poses),
         "lost": listed(counters.drops, verbose),
-        "resets": str(resets) if resets or verbose else "",
+        "resets": str(counters.resets) if counters.resets or verbose else "",
         "places": listed(counters.places) if verbose else "",
         "length": f"{counters.length_m:.4f} m",
-        "states": ", ".join(f"{s} {n / (poses or 1):.1%}" for s, n in counters.states.items() if n or verbose),
+        "states": ", ".join(f"{s} {n / (counters.poses or 1):.1%}" for s, n in counters.states.items() if n or verbose),
     }
     return {name: text for name, text in found.items() if text or name == "states"}
 

@@ -144,7 +144,7 @@ class RunResult:
 
 
 def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> RunResult:
-    """Run a log (an MCAP file or a folder of them) through the stages and return the result.
+    """Run a log (any that open_log reads) through the stages and return the result.
 
     Prints nothing. A first SIGINT, SIGTERM or SIGHUP ends the run early with whole files and `signal` in the result; a
     second one ends the process at once. Raises OmnidError, DriverError or CalibError for wrong input and
@@ -152,8 +152,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
     """
     options = options or ReplayOptions()
     # 1. No output may be an input, or another output.
-    logs = [log, *sorted(log.glob("*.mcap"))]  # those of a folder also by another name
-    named = [*(("log", path) for path in logs), ("rig", options.rig), ("configuration", options.settings)]
+    named = [("log", log), ("rig", options.rig), ("configuration", options.settings)]
     check_outputs(options.files, [(f"the {what} that is read", path) for what, path in named if isinstance(path, Path)])
     if options.map_tum and not config.places.enabled:
         raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")

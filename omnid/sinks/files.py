@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.logs.log_reader import is_log_name
 from omnid.errors import OmnidError
 from omnid.formats.tum import tum_row
 from omnid.messages import OdometryUpdate
@@ -22,9 +23,10 @@ Named: TypeAlias = Sequence[tuple[str, Path]]
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written, and none is another one or an input (name, path).
 
-    Leaves no file behind. Raises OmnidError.
+    Inputs are files, or folders of which the logs are read. Leaves no file behind. Raises OmnidError.
     """
     used = {_identity(path): what for what, path in inputs}
+    used |= {_identity(log): what for what, path in inputs for log in path.glob("*") if is_log_name(log.name)}
     for option, path in outputs:
         wrong = ""
         if path.is_dir():

@@ -89,7 +89,7 @@ def test_the_readable_part_of_a_truncated_log_is_used(omnid: Command, tmp_path: 
     assert len(rows(tum)) == result.count("pairs")
 
 
-def test_a_replay_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_no_command_overwrites_its_inputs(omnid: Command, tmp_path: Path, scene: Path) -> None:
     bag, rig, settings = tmp_path / "bag", tmp_path / "rig.toml", tmp_path / "omnid.toml"
     bag.mkdir()
     shutil.copy(scene / "log.mcap", bag / "bag_0.mcap")
@@ -105,6 +105,7 @@ def test_a_replay_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, 
     ):
         error = omnid.refused("replay", bag, "--rig", rig, "--config", settings, "--quiet", "--record", path)
         assert f"the {what} that is read" in error
+    assert "the log that is read" in omnid.refused("report", bag, "--output", bag / "bag_0.mcap")
     assert {path: path.read_bytes() for path in before} == before
 
 
