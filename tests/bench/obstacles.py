@@ -108,7 +108,7 @@ class Asker:
     """Arms, then asks for the way or for the goal; ends the drive there, or where the base stands."""
 
     def __init__(self, asked: Trial, planned: Planned) -> None:
-        self._asked, self._stands_s = asked, STANDS_S if asked.things is None else HAZARD_STANDS_S
+        self._asked, self._stands_s = asked, STANDS_S if asked.objects is None else HAZARD_STANDS_S
         speed_mps = -planned.speed_mps if asked.motion == "back" else planned.speed_mps
         self._setpoint = Setpoint(speed_mps, heading_rad=0.0)
         if planned.is_turning:
@@ -196,7 +196,7 @@ def judged(run: SimulatedRun, asked: Trial, robot: SimulatedRobot, asked_m: floa
     own = sum(bool(speeds[tick] > OWN_MPS) for tick in at_contact)
     is_through = driven_m >= DRIVEN * asked_m
     stopped_m = None
-    if asked.things is not None and asked.motion == "ahead" and not is_through:
+    if asked.objects is not None and asked.motion == "ahead" and not is_through:
         stopped_m = _from_hazard_m(run, asked, robot)
     # 3. Why, in the daemon's words.
     stops = [line.removeprefix("the wheels stop: ") for _, line in run.lines if line.startswith("the wheels stop")]
@@ -212,8 +212,8 @@ def _from_hazard_m(run: SimulatedRun, asked: Trial, robot: SimulatedRobot) -> fl
     people = Walkers(asked.world.people)
     for tick in run.ticks:
         people.advance(tick.time_s, tick.pose[:2])
-    things = (*(asked.things or ()), *people.faces())
-    segments = np.concatenate([asked.world.footprints(things, robot.height_m), asked.world.edges])
+    objects = (*(asked.objects or ()), *people.faces())
+    segments = np.concatenate([asked.world.footprints(objects, robot.height_m), asked.world.edges])
     if asked.world.name == "steep_ramp":  # it begins there
         x_m = asked.world.ground.profile[0][0]
         segments = np.array([[[x_m, -1.2], [x_m, 1.2]]])

@@ -1,12 +1,12 @@
 """Stored pairs along the ways of worlds like buildings, with the truth: `tests.bench.obstacles --open-loop FOLDER`.
 
 Nothing stops the base: it drives on until it is 0.15 m from what is in the way. Each drive is a file of numpy, which
-any method can be tried on, and what today's scan told of it. Arrays by pair (N): lower, upper (N, H, W) uint8;
+any method can be tried on, and what today's scan showed of it. Arrays by pair (N): lower, upper (N, H, W) uint8;
 stamps_ns; T_world_base (N, 4, 4), true; first_m (N, 360), the range from the base's origin in its sectors to the first
-thing that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; scan_m, sigma_m,
-free_m (N, 360) of the scan, NaN where there was none. cells (2, D): cells of the grids of all pairs by their said
-probability of a thing, in steps of DECADES, and those of them that a thing is in. Of the world: T_base_rig (4, 4), as
-its file says; profile (P, 2), the heights z of the floor at places x; radius_m and height_m of the base.
+object that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; scan_m,
+sigma_m, free_m (N, 360) of the scan, NaN where there was none. cells (2, D): cells of the grids of all pairs by their
+said probability of an object, in steps of DECADES, and those of them that an object is in. Of the world: T_base_rig
+(4, 4), as its file says; profile (P, 2), the heights z of the floor at places x; radius_m and height_m of the base.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def add_scan_table(paths: Sequence[Path]) -> None:
 
 
 def add_reliability_table(paths: Sequence[Path]) -> None:
-    """Print and write the share of cells in which a thing is, by the probability of one that the grid says."""
+    """Print and write the share of cells in which an object is, by the probability of one that the grid says."""
     cells = sum(np.load(path)["cells"] for path in paths)
     head = columns("said probability", "cells", "true share||5")
     table = ResultTable("obstacles_reliability", "Cells of the grid against the truth", head)
@@ -171,7 +171,7 @@ def add_reliability_table(paths: Sequence[Path]) -> None:
 def judge_scans(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
     """Make the files that are missing, and print a row for each world."""
     ahead = "free of what is free up to 3 m, within 15 degrees|%|0"
-    head = columns("world", "scans", ahead, "rays falsely free more than 0.1 m beyond the first thing|%|1")
+    head = columns("world", "scans", ahead, "rays falsely free more than 0.1 m beyond the first object|%|1")
     table = ResultTable("obstacles_open_loop", "The obstacle scan on stored pairs", head)
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         paths = list(pool.map(stored, wanted, [folder] * len(wanted)))

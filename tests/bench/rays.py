@@ -1,7 +1,7 @@
 """Pictures of the posterior of rays: `python -m tests.bench.rays FILE.png [WORLD ...]`.
 
 The base drives ahead for some seconds; of the last pair a panel shows for each direction the probability by range that
-the first thing begins there (dark), and the range up to which floor is likelier than a thing (blue).
+the first object begins there (dark), and the range up to which floor is likelier than an object (blue).
 """
 
 from __future__ import annotations

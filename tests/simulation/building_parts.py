@@ -34,7 +34,7 @@ from omnid.simulation.rendering.surfaces import (
 )
 
 Point3 = tuple[float, float, float]
-# A box of a thing: the middle of its bottom, x, y, z, from the middle of the thing, then its sides along them [m].
+# A box of an object: the middle of its bottom, x, y, z, from the middle of the object, then its sides along them [m].
 Part = tuple[float, float, float, float, float, float]
 WALL_PX_PER_M: Final = 100.0
 THING_PX_PER_M: Final = 250.0
@@ -54,7 +54,7 @@ class Opening:
 
 
 def four_legs(aside_m: Point, side_m: float, height_m: float) -> list[Part]:
-    """Return four legs; aside_m: of their middles from the middle of the thing, along x and y."""
+    """Return four legs; aside_m: of their middles from the middle of the object, along x and y."""
     x, y = aside_m
     return [(i * x, j * y, 0.0, side_m, side_m, height_m) for i in (1, -1) for j in (1, -1)]
 
@@ -297,10 +297,10 @@ class Builder:
         ribs[:, ::5] = 175
         self._hang(first, along, (left_m, width_m), (0.12, 0.72), ribs, "radiator", 0.08)
 
-    # Things
+    # Objects
 
-    def thing(self, parts: Iterable[Part], at: Point, yaw_rad: float, paint: Paint) -> None:
-        """Add the boxes of one thing."""
+    def object(self, parts: Iterable[Part], at: Point, yaw_rad: float, paint: Paint) -> None:
+        """Add the boxes of one object."""
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         for x, y, z, length_m, width_m, height_m in parts:
             place, size_m = (at[0] + c * x - s * y, at[1] + s * x + c * y, z), (length_m, width_m, height_m)
@@ -316,26 +316,26 @@ class Builder:
             leg, castor = ((at[0] + away_m * c, at[1] + away_m * s) for away_m in (0.16, 0.3))
             self.faces += solid((*leg, 0.06), (0.3, 0.045, 0.035), angle, legs)
             self.faces += solid((*castor, 0.0), (0.05, 0.05, 0.06), angle, legs, is_raised=False)
-        self.thing([(0.0, 0.0, 0.08, 0.06, 0.06, 0.36)], at, yaw_rad, legs)
-        self.thing([(0.0, 0.0, 0.44, 0.46, 0.48, 0.08), (-0.22, 0.0, 0.58, 0.06, 0.42, 0.5)], at, yaw_rad, cloth)
+        self.object([(0.0, 0.0, 0.08, 0.06, 0.06, 0.36)], at, yaw_rad, legs)
+        self.object([(0.0, 0.0, 0.44, 0.46, 0.48, 0.08), (-0.22, 0.0, 0.58, 0.06, 0.42, 0.5)], at, yaw_rad, cloth)
 
     def table(self, at: Point, size_m: Point3, yaw_rad: float = 0.0) -> None:
         """Add a plate on four legs; size: length, width, height."""
         (length, width, height), thick = size_m, 0.03
         legs = four_legs((length / 2 - 0.05, width / 2 - 0.05), 0.05, height - thick)
-        self.thing(legs, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(40, 180)))
+        self.object(legs, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(40, 180)))
         plate = [(0.0, 0.0, height - thick, length, width, thick)]
-        self.thing(plate, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 225), 1.5))
+        self.object(plate, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 225), 1.5))
 
     def shelf(self, at: Point, yaw_rad: float) -> None:
         """Add boards between two sides, with books and boxes on them."""
         width_m = 0.9
         boards = [(0.0, 0.0, z, 0.35, width_m, 0.02) for z in (0.08, 0.45, 0.82, 1.19, 1.56)]
         sides = [(0.0, y, 0.0, 0.35, 0.02, 1.8) for y in (width_m / 2, -width_m / 2)]
-        self.thing([*boards, *sides], at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 210), 1.5))
+        self.object([*boards, *sides], at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 210), 1.5))
         for z in (0.1, 0.47, 0.84, 1.21):
             row = (-0.03, 0.0, z, 0.25, width_m - 0.08, self.rng.uniform(0.2, 0.3))
-            self.thing([row], at, yaw_rad, poster_paint(self.rng))
+            self.object([row], at, yaw_rad, poster_paint(self.rng))
 
     def adult(self, height_m: float = 1.75) -> tuple[Rectangle, ...]:
         """Return a person on the origin who looks along x."""
@@ -392,7 +392,7 @@ def trolley(b: Builder) -> list[Part]:
 
 
 def put_thing(b: Builder, kind: str, at: Point) -> None:
-    """Add a thing of a room."""
+    """Add an object of a room."""
     rng, yaw_rad = b.rng, b.rng.uniform(0, math.tau)
     if kind == "chair":
         b.star_chair(at, yaw_rad)
@@ -402,7 +402,7 @@ def put_thing(b: Builder, kind: str, at: Point) -> None:
         spans = {"box": (0.3, 0.6), "carton": (0.3, 0.5), "bin": (0.25, 0.3)}[kind]
         size_m = rng.uniform(*spans), rng.uniform(*spans), rng.uniform(0.3, 0.9)
         grey, grain = rng.uniform(40, 220), 6.0 if kind == "carton" else 1.0
-        b.thing([(0.0, 0.0, 0.0, *size_m)], at, yaw_rad, plain_paint(rng, grey, grain))
+        b.object([(0.0, 0.0, 0.0, *size_m)], at, yaw_rad, plain_paint(rng, grey, grain))
 
 
 def _px(sides_m: Point) -> tuple[int, int]:

@@ -63,11 +63,11 @@ SIDE_RAYS: Final = 3 * 512
 class Trial:
     """A world, the robot in it, and what is asked: the way straight on, or the goal.
 
-    At a hazard, `things` and the edges of the floor are what must not be touched, and may end the way.
+    At a hazard, `objects` and the edges of the floor are what must not be touched, and may end the way.
     """
 
     world: BuildingWorld
-    things: tuple[Rectangle, ...] | None = None  # None: nothing is in the way
+    objects: tuple[Rectangle, ...] | None = None  # None: nothing is in the way
     motion: Literal["ahead", "back", "turn left"] = "ahead"  # that is asked for
     changes: tuple[tuple[str, object], ...] = ()  # of fields of the robot
     way_m: float = 8.0  # that is asked for straight on
@@ -173,7 +173,7 @@ def _trolley_leaves(b: Builder) -> Trial:
     """A trolley stands in the way; after a while it is pulled on."""
     _, high = corridor(b, width_m=2.0, length_m=20.0)
     first = len(b.faces)
-    b.thing(trolley(b), (0.0, 0.0), 0.0, plain_paint(b.rng, b.rng.uniform(60, 170), 3.0))
+    b.object(trolley(b), (0.0, 0.0), 0.0, plain_paint(b.rng, b.rng.uniform(60, 170), 3.0))
     cart, b.faces = tuple(b.faces[first:]), b.faces[:first]
     path = ((2.2, 0.0), (high[0] - 1.2, 0.0))
     return Trial(built(b, people=(Person(cart, Walker(path, 0.9, start_s=b.rng.uniform(9.0, 11.0))),)))
@@ -221,7 +221,7 @@ def _door(b: Builder, kind: str) -> Trial:
 def _office(b: Builder) -> Trial:
     """Desks with star-legged chairs along both walls, and one chair on the way."""
     b.space((-1.4, -2.2), (6.2, 2.4), doors=1, windows=3, pictures=2)
-    b.thing([(0.0, 0.0, 0.0, 0.28, 0.28, 0.33)], (0.4, -1.8), 0.0, plain_paint(b.rng, 60.0))
+    b.object([(0.0, 0.0, 0.0, 0.28, 0.28, 0.33)], (0.4, -1.8), 0.0, plain_paint(b.rng, 60.0))
     b.shelf((-1.1, -1.2), 0.0)
     for at_m, y_m in ((1.2, 1.9), (3.6, 1.9), (2.4, -1.75), (5.0, -1.75)):
         x_m, inwards = at_m + b.rng.uniform(-0.2, 0.2), math.copysign(1.0, -y_m)
@@ -235,7 +235,7 @@ def _office(b: Builder) -> Trial:
 
 
 def _clutter(b: Builder) -> Trial:
-    """A room full of things, through which a way is left."""
+    """A room full of objects, through which a way is left."""
     b.space((-1.4, -2.4), (5.6, 2.4), doors=1, windows=2, pictures=1)
 
     def put() -> None:
@@ -250,7 +250,7 @@ def _clutter(b: Builder) -> Trial:
 
 
 def _with_a_way(b: Builder, goal: Pose, put: Callable[[], None]) -> Trial:
-    """Return the trial with things put at random, again and again until a way leads to the goal."""
+    """Return the trial with objects put at random, again and again until a way leads to the goal."""
     empty = len(b.faces)
     for _ in range(200):
         put()

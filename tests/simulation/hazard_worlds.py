@@ -34,7 +34,7 @@ from tests.simulation.building_parts import (
 from tests.simulation.disturbed import Ground, Push, Slip
 from tests.simulation.harmless_worlds import Makers, Trial, built, made
 
-PRINTED: Final = ("box", "low_box", "block", "shelf", "drawer", "table")  # things with pictures on them
+PRINTED: Final = ("box", "low_box", "block", "shelf", "drawer", "table")  # objects with pictures on them
 LENGTH_M: Final = 12.0
 WALKER_MPS: Final = 0.5  # of the robot whose way people cross
 
@@ -46,10 +46,10 @@ def trial(name: str, seed: int, floor: str | None = None) -> Trial:
     return found
 
 
-# Things on the floor, or over it, from the middle of what is in the way: their parts, each drawn by `u` from a range,
+# Objects on the floor, or over it, from the middle of what is in the way: their parts, each drawn by `u` from a range,
 # and the largest angle by which they are turned [deg].
 Draw = Callable[[float, float], float]
-THINGS: Final[dict[str, tuple[Callable[[Draw], list[Part]], float]]] = {
+OBJECTS: Final[dict[str, tuple[Callable[[Draw], list[Part]], float]]] = {
     "box": (lambda u: [(0, 0, 0, u(0.25, 0.6), u(0.25, 0.6), u(0.4, 1.2))], 40),
     "low_box": (lambda u: [(0, 0, 0, u(0.25, 0.6), u(0.25, 0.6), 0.08)], 40),
     "block": (lambda u: [(0, 0, 0, u(0.25, 0.5), u(0.25, 0.5), u(0.15, 0.6))], 90),
@@ -129,7 +129,7 @@ def _wide_corridor(b: Builder) -> None:
 
 def _hazard(b: Builder, first: int, **fields: object) -> Trial:
     """Return the trial in which what was built since a number of faces is in the way."""
-    return Trial(built(b, **fields), things=tuple(b.faces[first:]))
+    return Trial(built(b, **fields), objects=tuple(b.faces[first:]))
 
 
 def _place(b: Builder) -> Point:
@@ -142,17 +142,17 @@ def kind_paint(rng: np.random.Generator, kind: str) -> Paint:
 
 
 def _put(b: Builder, name: str, paint: Paint, at: Point) -> None:
-    """Add a thing whose nearest part is at a place, turned at random."""
-    parts_of, most_deg = THINGS.get(name, (lambda _: trolley(b), 180))
+    """Add an object whose nearest part is at a place, turned at random."""
+    parts_of, most_deg = OBJECTS.get(name, (lambda _: trolley(b), 180))
     yaw_rad = math.radians(b.rng.uniform(-most_deg, most_deg))
     first = len(b.faces)
-    b.thing(parts_of(b.rng.uniform), (0.0, 0.0), yaw_rad, paint)
+    b.object(parts_of(b.rng.uniform), (0.0, 0.0), yaw_rad, paint)
     nearest_m = min(float(face.corners[:, 0].min()) for face in b.faces[first:])
     shift = np.array([at[0] - nearest_m, at[1], 0.0])
     b.faces[first:] = [replace(face, origin=face.origin + shift) for face in b.faces[first:]]
 
 
-def _thing(b: Builder, plain: str, name: str) -> Trial:
+def _object(b: Builder, plain: str, name: str) -> Trial:
     _wide_corridor(b)
     first = len(b.faces)
     if plain:
@@ -166,7 +166,7 @@ def _thing(b: Builder, plain: str, name: str) -> Trial:
 
 
 def _contrast(b: Builder, name: str, percent: str) -> Trial:
-    """A thing, or a drop of 15 cm, whose grey as it is seen differs from the floor's by so many per cent."""
+    """An object, or a drop of 15 cm, whose grey as it is seen differs from the floor's by so many per cent."""
     share = 1 + float(b.rng.choice([-1, 1])) * float(percent) / 100
     if name == "edge":
         return _edge(b, "15", share)
@@ -208,7 +208,7 @@ def _edge(b: Builder, drop_cm: str, share: float | None = None, stairs: int = 1)
         b.upright(a, c, (-depth_m, 0.0), b.wall_grey)
     b.upright((LENGTH_M, half_m), (LENGTH_M, -half_m), (-depth_m, 0.0), b.wall_grey)
     edge = np.array([[[at_m, -half_m], [at_m, half_m]]])
-    return Trial(built(b, ground=Ground(tuple(profile)), edges=edge), things=())
+    return Trial(built(b, ground=Ground(tuple(profile)), edges=edge), objects=())
 
 
 def _steep_ramp(b: Builder) -> Trial:
@@ -223,7 +223,7 @@ def _steep_ramp(b: Builder) -> Trial:
     for a, c in (((at_m, 1.2), (LENGTH_M, 1.2)), ((LENGTH_M, -1.2), (at_m, -1.2)), ((LENGTH_M, 1.2), (LENGTH_M, -1.2))):
         b.upright(a, c, (-down_m, 0.0), b.wall_grey)
     ground = Ground(((at_m, 0.0), (at_m + 2.0, -down_m)))
-    return Trial(built(b, ground=ground), things=(), way_m=at_m + 3.0)
+    return Trial(built(b, ground=ground), objects=(), way_m=at_m + 3.0)
 
 
 def _white_wall(b: Builder) -> Trial:
@@ -247,11 +247,11 @@ def _glass_with_frame(b: Builder) -> Trial:
     frame = plain_paint(b.rng, float(b.rng.choice([60.0, 170.0, 220.0])))
     uprights: list[Part] = [(0.0, y, 0.0, 0.05, 0.05, 2.1) for y in (-1.5, -0.5, 0.5, 1.5)]
     across: list[Part] = [(0.0, 0.0, z, 0.04, 3.0, 0.06) for z in (0.0, 2.05)]
-    b.thing([*uprights, *across, (-0.05, 0.4, 0.9, 0.03, 0.03, 0.35)], (at_m, 0.0), 0.0, frame)
+    b.object([*uprights, *across, (-0.05, 0.4, 0.9, 0.03, 0.03, 0.35)], (at_m, 0.0), 0.0, frame)
     for left_m in (1.5, 0.5, -0.5):
         origin, along = np.array([at_m, left_m, 2.05]), np.array([0.0, -1.0, 0.0])
         b.panes.append(Rectangle(origin, along, np.array([0.0, 0.0, -1.99]), np.full((8, 8), 255, np.uint8), "pane"))
-    return replace(_hazard(b, first), things=(*b.faces[first:], *b.panes))
+    return replace(_hazard(b, first), objects=(*b.faces[first:], *b.panes))
 
 
 def _star_legs(b: Builder) -> Trial:
@@ -265,7 +265,7 @@ def _star_legs(b: Builder) -> Trial:
 
 
 def _people(b: Builder, *people: Person) -> Trial:
-    return Trial(built(b, people=people), things=())
+    return Trial(built(b, people=people), objects=())
 
 
 def _standing(b: Builder, height_m: float) -> Trial:
@@ -374,7 +374,7 @@ def _robot(b: Builder, **changes: object) -> Trial:
 LEFT, RIGHT = SimulatedRobot.wheel_errors
 CROSSING: Final = ("straight", "diagonally", "like_the_floor", "two", "from_a_door", "turns_round")
 NEAR: Final = ("white_pole", "textured_pole", "box", "person")
-ALL_THINGS: Final = (*THINGS, "trolley")
+ALL_OBJECTS: Final = (*OBJECTS, "trolley")
 # Worlds in which nothing is in the way, but for those of harmless_worlds.
 OF_ROBOT: Final[Makers] = {
     "lean_1deg": (None, partial(_robot, lean_rad=(0.0, math.radians(1.0)))),
@@ -386,7 +386,7 @@ OF_ROBOT: Final[Makers] = {
 MAKERS: Final[Makers] = {
     **harmless_worlds.MAKERS,
     **OF_ROBOT,
-    rf"(plain_|)({'|'.join(ALL_THINGS)})": (None, _thing),
+    rf"(plain_|)({'|'.join(ALL_OBJECTS)})": (None, _object),
     r"(pole|box|leg|edge)_(\d+)percent": ("linoleum", _contrast),
     r"edge_(\d+)cm": (None, _edge),
     "stairs_down": (None, partial(_edge, drop_cm="17", stairs=5)),
@@ -404,8 +404,8 @@ MAKERS: Final[Makers] = {
 }
 HARMLESS: Final = (*harmless_worlds.NAMES, *OF_ROBOT)
 HAZARDS: Final = (
-    *ALL_THINGS,
-    *(f"plain_{name}" for name in ALL_THINGS),
+    *ALL_OBJECTS,
+    *(f"plain_{name}" for name in ALL_OBJECTS),
     *(f"{name}_{percent}percent" for name in ("pole", "box", "leg", "edge") for percent in (10, 20)),
     *(f"edge_{drop}cm" for drop in (8, 15, 30, 50)),
     *("stairs_down", "steep_ramp", "white_wall", "glass_with_frame", "star_legs", "person_stands", "child_stands"),

@@ -175,7 +175,7 @@ class BaseAmongPatches(DrivenBase):
         occupied: float = math.nan,
         settings: NavigationSettings = SETTINGS,
     ) -> None:
-        """occupied: probability of a thing in each cell that no scan has shown to be free."""
+        """occupied: probability of an object in each cell that no scan has shown to be free."""
         super().__init__(Navigator(settings), 1)
         self.occupied = occupied
         self.boxes, self.floor, self.around = patches, Floor(), None
