@@ -47,6 +47,9 @@ def prepare() -> None:
     All memory is locked where that has no limit (LimitMEMLOCK=infinity): under one, later allocations would fail.
     """
     sys.setswitchinterval(1e-3)
+    # Arrays of a pair take the memory of those before; else the kernel clears it anew, by a thousand page faults.
+    _LIBC.mallopt(-3, 2**25)  # M_MMAP_THRESHOLD
+    _LIBC.mallopt(-1, 2**28)  # M_TRIM_THRESHOLD
     gc.collect()
     gc.freeze()  # what exists at the start is not examined again
     if os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY:
