@@ -96,10 +96,8 @@ class Encoder:
             case Diagnostics():
                 yield "status", codec.diagnostics_cdr(stamp_ns, message.statuses)
             case NavigationUpdate():
-                status = entry(NAVIGATION, navigation_stats(message))
-                yield "navigation", codec.diagnostics_cdr(stamp_ns, [status])
-                if message.plan is not None:
-                    plan = message.plan
+                yield "navigation", codec.diagnostics_cdr(stamp_ns, [entry(NAVIGATION, navigation_stats(message))])
+                if (plan := message.plan) is not None:
                     yield "plan", codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad)
 
     def _poses(self, odometry: OdometryUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
@@ -143,8 +141,7 @@ class Encoder:
     def _map_pose(self, update: PlaceUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
         if update.state != self._state_in_map:
             self._state_in_map = update.state
-            status = entry(PLACES, {Key.STATE: update.state})
-            yield "status", codec.diagnostics_cdr(stamp_ns, [status])
+            yield "status", codec.diagnostics_cdr(stamp_ns, [entry(PLACES, {Key.STATE: update.state})])
         T_map_base, covariance = carried(update.T_map_rig, update.covariance, self._T_base_rig)
         pose = (T_map_base, np.ravel(in_outer_axes(T_map_base, covariance)))
         yield MAP_POSE, codec.encoded(codec.MAP_POSE_SCHEMA, (stamp_ns, "map"), pose)

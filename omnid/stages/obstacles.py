@@ -56,6 +56,8 @@ def sectors_of(tiles: Flags, cylinder: Cylinder, T_base_rect: Array, ranges_m: S
     T_base_rect (4, 4): from the rectified frame to the base; inf: directions from the viewpoint.
     """
     found = np.zeros(SECTORS, bool)
+    if not tiles.any():  # as in nearly all pairs
+        return found
     width_px = cylinder.width / tile_columns(cylinder)
     across = np.linspace(0.0, 1.0, 2 * SECTORS // TILE_COLUMNS + 1)  # a tile, so that each sector has two samples
     columns = ((np.flatnonzero(tiles)[:, None] + across) * width_px - 0.5).ravel()
