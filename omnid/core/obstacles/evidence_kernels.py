@@ -35,6 +35,9 @@ STRIP_PRIOR = np.float32(0.5)  # log-odds by which a strip of a surface must exc
 # only holes are, and what a polished floor mirrors. By trial: of walls of bricks, which may be farther ones below the
 # floor, 94 % were found with 0.1 and 0.03, 92 % with 0.3, 66 % with 1.
 FLOOR_WEIGHT, BELOW_WEIGHT = np.float32(10.0), np.float32(0.1)
+# Rows by which a strip of the floor may be displaced: a pixel of an image is up to 1.8 of them wide, and a thin joint
+# may be seen half a pixel aside in each view. So it is no surface.
+MOVED_ROWS = 1
 # An object often hides the floor near itself: decay of the prior with the disparity, and the share of it that is left
 # far away. Measured: two thirds to 1.5 times as much change nothing.
 ADJACENT_PX, DISTANT_SHARE = 4.0, np.float32(0.1)
@@ -270,7 +273,8 @@ def surface_evidence(
     """
     bins, width = surface.shape
     sums, second = np.empty((bins, width), np.uint16), np.zeros((bins, width), np.uint16)
-    half, floor, best = np.empty(width, np.uint16), np.empty(width, np.uint16), np.empty(width, np.uint16)
+    floor = np.empty((2 * MOVED_ROWS + 1, width), np.uint16)
+    half, best = np.empty(width, np.uint16), np.empty(width, np.uint16)
     value, total = np.zeros((bins + 2, width), np.float32), np.empty(width, np.float32)
     run, plain = np.zeros((bins, width), np.float32), np.empty(width, np.float32)
     surface[:] = NOTHING
@@ -291,10 +295,12 @@ def surface_evidence(
         # 2. The likelihoods of the floor and of all disparities.
         weights = below * BELOW_WEIGHT + (last - below)
         if strips[n, STRIP_FLOOR] > 0:
-            sum_differences(lower, on_plane, live, first, end, 0, floor)
-            np.minimum(floor, best, best)
-            add_likelihoods(floor, best, DIFFERENCE_SCALE, FLOOR_WEIGHT, plain, total)
-            weights += FLOOR_WEIGHT
+            for m in range(len(floor)):
+                sum_differences(lower, on_plane, live, first, end, m - MOVED_ROWS, floor[m])
+                np.minimum(floor[m], best, best)
+            for m in range(len(floor)):
+                add_likelihoods(floor[m], best, DIFFERENCE_SCALE, FLOOR_WEIGHT, plain, total)
+                weights += FLOOR_WEIGHT
         for d in range(last):
             add_likelihoods(sums[d], best, DIFFERENCE_SCALE, BELOW_WEIGHT if d < below else ONE, value[d + 1], total)
         # 3. The runs.

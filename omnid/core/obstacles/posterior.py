@@ -41,6 +41,7 @@ MAD: Final = 1.48  # sigma of a normal distribution by the median of its magnitu
 LEAST_STEP: Final = 0.35  # sigma of a step by the rounding of greys
 TYPICAL_M: Final = 1.3  # range at which the near floor is seen
 SIDE: Final = 3  # directions on either side with which a bin is compared
+LEAST_OTHERS: Final = 0.1  # least share of the floor that looks otherwise in one feature
 LEAST: Final = 1e-30  # density, so that logarithms are finite
 ALONG_RAD: Final = math.radians(35.0)  # about ahead and behind: floor there is assumed before any is known
 
@@ -78,7 +79,7 @@ def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -
     floor = P.w_floor * np.clip(floor, -P.floor_most, P.floor_most)
     # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L counts
     # by the odds that it is more than that.
-    levels = shown.levels
+    levels = np.stack([shown.levels[0], _along_edges(shown.levels[1], ranges_m)])
     noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
     levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
     levels = floor - P.w_level * np.clip(levels, -P.level_most, P.level_most)
@@ -99,6 +100,16 @@ def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -
     kernels.posterior(terms, lengths_m, far, shown.near, float(bins.ends_m[0]), first, ratios, view)
     surfaces = np.ascontiguousarray(shown.surface.T)
     return RayBelief(first, ratios, np.where(seen.T, view, np.float32(0)), surfaces, bins.ends_m)
+
+
+def _along_edges(ratios: Floats, ranges_m: Array) -> Floats:
+    """Return the means of ratios (N, D) over the directions in which an edge lies at ranges (N, 1)."""
+    half = np.rint(0.5 * P.edge_m / ranges_m * (DIRECTIONS / math.tau)).astype(int)
+    beside = int(half.max(initial=0)) + 1
+    sums = np.cumsum(turned(ratios, beside), axis=1, dtype=float)
+    at = np.arange(DIRECTIONS) + beside
+    ends = (np.take_along_axis(sums, at + shift, axis=1) for shift in (half, -half - 1))
+    return np.asarray(np.subtract(*ends) / (2 * half + 1), np.float32)
 
 
 def _step_sigmas(steps: Floats, near: Flags, known: Flags) -> Floats:
@@ -150,7 +161,7 @@ def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
     z = np.asarray(contrast - np.median(contrast[near]), np.float32)
     sigma = np.float32(max(_sigma_of(z[near]), 0.25))
     anything = _noise(contrast - 1, np.float32(1.3), 0.0)
-    by_contrast = _ratio_of_look(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0), anything)
+    by_contrast = _ratio_of_look(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0) / anything, near)
     # 2. The difference to both sides, of a bin or of five, whichever is less. A thing shows an outline in half of its
     #    directions.
     side = turned(greys, SIDE)
@@ -158,7 +169,7 @@ def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
     five = cv2.blur(one, (1, 5))
     outline = np.asarray(np.where(np.abs(one) < np.abs(five), one, five), np.float32)
     core = _noise(outline, np.float32(max(_sigma_of(outline[near]), 0.8)) * np.sqrt(far), P.tail)
-    by_outline = _ratio_of_look(core, np.float32(0.5) * (core + _laplace(np.abs(outline), scale)))
+    by_outline = _ratio_of_look(2 * core / (core + _laplace(np.abs(outline), scale)), near)
     # 3. The grey, by that of the floor at the same range where it is known.
     middles = np.full((len(greys), 1), grey, np.float32)
     sigmas = np.full_like(middles, max(_sigma_of(greys[near] - grey), P.grey_share * grey))
@@ -167,7 +178,7 @@ def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
     of_rows = MAD * _row_medians(np.abs(greys[known] - middles[known]), near[known])
     sigmas[known, 0] = np.clip(of_rows, P.near_grey_share * grey, sigmas[known, 0])
     z = greys - middles
-    by_grey = _ratio_of_look(_noise(z, sigmas, 0.0), _laplace(np.abs(z), 1.5 * scale))
+    by_grey = _ratio_of_look(_noise(z, sigmas, 0.0) / _laplace(np.abs(z), 1.5 * scale), near)
     # Far away the light of the near floor is all that is known.
     lowest = P.look_low * (1 + known[:, None])
     total = np.clip(by_contrast, P.look_low, P.look_high) + np.clip(by_outline, P.look_low, P.look_high)
@@ -188,9 +199,16 @@ def _laplace(magnitudes: Floats, scale: Floats | np.float32) -> Floats:
     return np.asarray(np.exp(-magnitudes / scale) / (2 * scale) + LEAST, np.float32)
 
 
-def _ratio_of_look(core: Floats, anything: Floats) -> Floats:
-    """Return the log-ratio of a feature of the floor, of which a tenth shows anything, to that of anything."""
-    return np.asarray(np.log(0.9 * core / anything + 0.1), np.float32)
+def _ratio_of_look(ratios: Floats, near: Flags) -> Floats:
+    """Return the log-ratios (N, D) of a feature of the floor, of which a share shows anything, to that of anything.
+
+    ratios (N, D) of the rest of the floor; near (N, D): bins that are floor, which show that share, such as boards of
+    other tones: a tenth at least.
+    """
+    share = LEAST_OTHERS
+    for _ in range(3):  # expectation and maximisation
+        share = max(float((share / (share + (1 - share) * ratios[near])).mean()), LEAST_OTHERS)
+    return np.asarray(np.log((1 - share) * ratios + share), np.float32)
 
 
 def _sigma_of(values: Floats) -> float:

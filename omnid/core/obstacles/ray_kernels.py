@@ -53,10 +53,12 @@ class RayParameters(NamedTuple):
     look_low: float = -2.5
     look_high: float = 1.0
     cell_most: float = 4.0
-    # Surfaces: the mean over so many directions counts as that of so many of them that have errors of their own, as a
-    # block of a JPEG is four wide. With 5 a joint of the floor, moved by the coding, was something that hangs.
+    # Surfaces: the mean over so many directions counts as that of so many of them that have errors of their own. Steps
+    # down are compared over this width [m]: what is narrower than a wheel's way is no edge, but a reflection below the
+    # floor may be.
     wide_columns: float = 11.0
-    wide_weight: float = 3.0
+    wide_weight: float = 5.0
+    edge_m: float = 0.2
     # Look of the floor: learned up to this range [m], from so many bins at least.
     look_m: float = 1.8
     look_bins: float = 60.0

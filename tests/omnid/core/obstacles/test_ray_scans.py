@@ -66,6 +66,13 @@ class BaseAtRest:
         return scan
 
 
+def without_a_quarter() -> np.ndarray:
+    """Return the pixels in view of cameras that do not see a quarter of the turn."""
+    visible, middle = SHOWN.copy(), CYLINDER.width // 2
+    visible[:, middle - CYLINDER.width // 8 : middle + CYLINDER.width // 8] = False
+    return visible
+
+
 @pytest.mark.parametrize("floor", [plain, worn, stains, worn_with_line])
 def test_floor_is_free_up_to_the_wall_whatever_it_shows(floor: Pattern) -> None:
     """A plain floor shows nothing, and no edge at which something could begin; a painted line is a mark."""
@@ -130,7 +137,8 @@ def test_a_hanging_bar_is_where_it_is_seen(floor: Pattern) -> None:
 def test_something_low_begins_at_its_front(floor: Pattern) -> None:
     """Over its top, which shows nothing, the floor behind is seen: its end alone is a surface."""
     scan = BaseAtRest(floor).scan(Block(1.4, 0.4, 0.1), pairs=PAIRS)
-    assert np.median(scan.free_m) > 1.2 and np.quantile(scan.free_m, 0.98) < 1.5
+    ways = scan.free_m.reshape(-1, 10).min(axis=1)  # of 24 cm at that range
+    assert np.median(scan.free_m) > 1.2 and ways.max() < 1.4 + 3 * CELL_M
 
 
 @pytest.mark.hazard("H19")
@@ -182,8 +190,8 @@ def test_an_obstacle_that_hides_the_nearest_floor_in_view_may_be_nearer() -> Non
 
 @pytest.mark.hazard("H19")
 def test_nothing_is_free_a_while_after_all_images_are_lost() -> None:
-    """Somebody may have come from where nothing was known, at 1.6 m/s."""
-    base = BaseAtRest(stains)
+    """Somebody may have come from where nothing was known, at 1.6 m/s: here from a quarter that no camera sees."""
+    base = BaseAtRest(stains, without_a_quarter())
     assert np.median(base.scan(pairs=PAIRS).free_m) > 0.75 * WALL_M
     assert base.scan(pairs=25, lost=SHOWN).free_m.max() < 0.5
     assert np.median(base.scan(pairs=PAIRS).free_m) > 0.6 * WALL_M
@@ -212,8 +220,7 @@ def test_floor_at_another_height_is_not_free(drop_m: float) -> None:
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_what_is_not_in_view_is_not_free(is_lost: bool) -> None:
     """A quarter of the turn is masked, or its tiles are dead."""
-    visible, middle = SHOWN.copy(), CYLINDER.width // 2
-    visible[:, middle - CYLINDER.width // 8 : middle + CYLINDER.width // 8] = False
+    visible = without_a_quarter()
     base = BaseAtRest(plain) if is_lost else BaseAtRest(plain, visible)
     scan = base.scan(pairs=PAIRS, lost=~visible if is_lost else None)
     assert scan.free_m[np.abs(azimuths()) < math.radians(35)].max() < 0.4
