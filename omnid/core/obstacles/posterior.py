@@ -90,7 +90,7 @@ def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -
     marks = float((np.abs(steps) > 5 * sigmas)[near].mean())
     plain = max(P.noise_share * sensor_grey, LEAST_STEP)
     edges = _edges(np.abs(steps), greys, sigmas, min((P.marks + 2 * marks) / 3, 0.5), plain)
-    look = _look(shown.steps, greys, near & (ranges_m < 1.6), np.maximum(ranges_m / TYPICAL_M, 1.0).astype(np.float32))
+    look = _look(shown.steps, greys, near, np.maximum(ranges_m / TYPICAL_M, 1.0).astype(np.float32))
     far = (shown.far / max(float(sigmas[-1, 0]), float(sigmas.min()))).astype(np.float32)
     # 4. The posterior.
     seen = shown.seen & (greys < SATURATED_GREY)

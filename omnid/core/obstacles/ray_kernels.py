@@ -60,7 +60,7 @@ class RayParameters(NamedTuple):
     wide_weight: float = 5.0
     edge_m: float = 0.2
     # Look of the floor: learned up to this range [m], from so many bins at least.
-    look_m: float = 1.8
+    look_m: float = 1.6
     look_bins: float = 60.0
 
 
