@@ -105,8 +105,6 @@ class Exposure:
         Also the spread (N,) [px] of the columns, twice the standard deviation by the uncertainty of the velocity. NaN
         where the disparity is unknown.
         """
-        if self.times.is_synchronised:
-            return np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]), np.zeros(len(pixels))
         known = np.flatnonzero(disparity > 0)
         views = np.column_stack([pixels, pixels[:, 1] + disparity])[known]
         shift = self.shift(triangulate(views, self.model.cylinder, self.model.baseline_m))
@@ -123,8 +121,6 @@ class Exposure:
         turn.
         """
         views = seen = np.column_stack([pixels, rows])
-        if self.times.is_synchronised:
-            return views, self.shift(views)
         for _ in range(ROUNDS):
             points = triangulate(views, self.model.cylinder, self.model.baseline_m)
             known = np.isfinite(points).all(axis=1, keepdims=True)

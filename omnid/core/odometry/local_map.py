@@ -265,11 +265,6 @@ class LocalMap:
         pixels, found = track(self.last, lower, before, predicted[:, :2], self._near_klt if near else self._coarse_klt)
         return Tracks(rows[found], pixels[found], predicted[found], len(rows), count / max(1, len(rows)))
 
-    def last_seen(self, max_count: int) -> tuple[PaddedPanorama | None, Indices]:
-        """Return the last panorama, and about max_count evenly chosen landmarks (M,) that were found in it."""
-        rows = np.flatnonzero(np.isfinite(self.table.pixels[:, 0]))
-        return self.last, rows[:: max(1, -(-len(rows) // max_count))]
-
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
         """Return the landmarks (M,) that a pose predicts in live parts of the panorama, and their views (M, 3) [px]."""
         points = se3.apply(se3.inverse(T_odom_rect), self.table.points)

@@ -130,10 +130,11 @@ def displacements(
     searched, is less than a step of the grid.
     """
     # 1. The grid, and the patches in the last panorama.
-    before, rows = local_map.last_seen(LANDMARKS)
-    if before is None or not len(rows):
-        return []
     table = local_map.table
+    rows = np.flatnonzero(np.isfinite(table.pixels[:, 0]))
+    rows = rows[:: max(1, -(-len(rows) // LANDMARKS))]
+    if local_map.last is None or not len(rows):
+        return []
     points = se3.apply(se3.inverse(T_odom_rect), table.points[rows])
     step_m = STEP_PX / model.cylinder.focal_px * float(np.median(np.hypot(points[:, 0], points[:, 1])))
     step_m = max(step_m, reach_m / MOST_STEPS)
@@ -141,7 +142,8 @@ def displacements(
         return []
     steps = math.ceil(reach_m / step_m)
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
-    patches, contrast = normalised_patches(before, np.rint(table.pixels[rows]), SAMPLES, SAMPLE_PX, _blurred(before))
+    at, blurred = np.rint(table.pixels[rows]), _blurred(local_map.last)
+    patches, contrast = normalised_patches(local_map.last, at, SAMPLES, SAMPLE_PX, blurred)
     textured = contrast > MIN_CONTRAST
     if not textured.any():
         return []

@@ -131,8 +131,6 @@ class VisualOdometry:
         if self.breaks is None:
             return estimate
         self.breaks.add((frame.lower, frame.upper), estimate, self._map, dt_s, self._cost)
-        if not self.breaks.fault and not self.breaks.covariance.any():
-            return estimate
         is_torn = self.breaks.fault and estimate.state is TrackingState.TRACKING
         state = TrackingState.DEGRADED if is_torn else estimate.state
         covariance = bounded(estimate.covariance + self.breaks.covariance)
