@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -66,6 +67,11 @@ class BaseAtRest:
         return scan
 
 
+def jointed(floor: Pattern, joint_m: float, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Return grey levels of a floor with a dark joint of 2 cm around the base."""
+    return np.where(np.abs(np.hypot(x_m, y_m) - joint_m) < 0.01, 100.0, floor(x_m, y_m))
+
+
 def without_a_quarter() -> np.ndarray:
     """Return the pixels in view of cameras that do not see a quarter of the turn."""
     visible, middle = SHOWN.copy(), CYLINDER.width // 2
@@ -109,6 +115,18 @@ def test_floor_behind_a_plain_thing_is_not_free(case: Case) -> None:
     assert scan.free_m[AHEAD].max() < max(case.obstacle.range_m, 0.3) + 0.15
     if isinstance(case.obstacle, Pole):
         assert np.median(scan.free_m[BEHIND]) > 0.75 * WALL_M
+
+
+@pytest.mark.parametrize("floor", [plain, worn])
+def test_a_joint_that_one_view_shows_displaced_is_floor(floor: Pattern) -> None:
+    """Pixels and coding move a joint of 2 cm by a row in one view."""
+    base = BaseAtRest(floor)
+    for seq in range(PAIRS):
+        (lower, _), (_, upper) = (
+            panoramas(partial(jointed, floor, at_m), WALL_M, striped, seed=seq) for at_m in (1.4, 1.38)
+        )
+        scan = base.scans.add(seq * PERIOD_NS, np.eye(4), lower, upper, None)
+    assert scan is not None and np.quantile(scan.free_m, 0.02) > 0.75 * WALL_M
 
 
 @pytest.mark.parametrize("lateral_m", [0.4, 0.5])
