@@ -195,7 +195,7 @@ def floor_evidence(
         first, end = patches[k, PATCH_FIRST], patches[k, PATCH_END]
         if end <= first:
             continue
-        # 1. Upright things at other disparities, of single thin ones.
+        # 1. Upright obstacles at other disparities, of single thin ones.
         together = patches[k, PATCH_THIN]
         others[k], weights = NOTHING, NOTHING
         sum_differences(lower, on_plane, live, first, end, 0, sums)

@@ -1,18 +1,18 @@
 """The grid of a run: what is known of cells of floor around the base, by the rays of all pairs.
 
-Cells of 5 cm, in the axes of odom and around the cell of the base, hold the log-odds L of a thing that stands, hangs or
-steps there, and whether they are known.
-1. Evidence of a pair: e = r log [q / (1 - q)] / [q_0 / (1 - q_0)] of each bin, q the probability that the first thing
-   is there where the ray comes with the probability r; q_0 its prior. So the prior of the rays does not count twice.
+Cells of 5 cm, in the axes of odom and around the cell of the base, hold the log-odds L of an obstacle there (upright,
+hanging, or a step), and whether they are known.
+1. Evidence of a pair: e = r log [q / (1 - q)] / [q_0 / (1 - q_0)] of each bin, q the probability that the first
+   obstacle is there where the ray comes with the probability r; q_0 its prior. So the prior of the rays counts once.
 2. Errors of pairs from one place are correlated, by rho, which falls to 0 over 5 cm of way. Of a pair
    counts what is new: L += e - rho e', e' that of the pair before. L forgets by (1 - rho) / n, as more than n views of
    a place are no more. What hangs over floor in view shows a surface in half of the pairs: the mean of what single
    pairs show, over 25 cm, has log-odds of its own.
-3. Hidden Markov prediction: something comes into a cell with a small probability in each pair, so L has a lower bound;
-   and what nobody sees may be entered from where nothing is known, at 1.6 m/s by a person, 25 cm wide.
-4. Too near to be seen: known by what is seen past a cell. What hides the nearest floor in view may stand anywhere
-   before it, unless something is known there.
-5. What has come: the first thing of a direction, where the floor was free a short while ago.
+3. Hidden Markov prediction: an obstacle comes into a cell with a small probability in each pair, so L has a lower
+   bound; and unobserved cells may be entered from unknown ones, at 1.6 m/s by a person, 25 cm wide.
+4. Too near to be seen: known by what is seen past a cell. What hides the nearest floor in view may be anywhere
+   before it, unless an obstacle is known there.
+5. Arrivals: the first obstacle of a direction, where the floor was free a short while ago.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ Rays = Indices  # (REACH_CELLS, SECTORS) of cells along the sectors in a flat gr
 class GridParameters:
     """The grid of cells; log-odds in nats."""
 
-    prior: float = -4.6  # of a thing in a cell
+    prior: float = -4.6  # of an obstacle in a cell
     floor: float = -7.0  # of a cell by whose look floor is known
-    least: float = -9.0  # least log-odds, as something may come into each cell in each pair
+    least: float = -9.0  # least log-odds, as an obstacle may come into each cell in each pair
     most: float = 6.0
     views: float = 3.0  # n: views of a place that count
     same_place: float = 0.9  # rho: correlation of the errors of pairs from one place, 0 after the way of a cell
@@ -59,7 +59,7 @@ class GridParameters:
     wall_end: int = 16  # and beside its ends, where it is in view
     wall_m: float = 0.2  # by which its foot is farther there than expected, at most
     wall_nats: float = 2.0  # log-odds of a wall that is assumed
-    arrival_nats: float = 2.0  # by which one pair shows a thing that has come [nats]
+    arrival_nats: float = 2.0  # by which one pair shows an obstacle that has come [nats]
     lately_s: float = 3.0  # for how long it counts that a cell was free
     arrival_m: float = 0.2  # least width of what has come,
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
@@ -92,7 +92,7 @@ class FloorGrid:
     """
 
     corner_m: Array  # (2,) outer corner of the first cell in odom, x and y
-    occupied: Floats  # (SIDE, SIDE) probability that something stands, hangs or steps there; NaN: unknown
+    occupied: Floats  # (SIDE, SIDE) probability of an obstacle (upright, hanging, a step); NaN: unknown
 
     @property
     def states(self) -> Bytes:
@@ -109,9 +109,9 @@ class FloorGrid:
 
 
 class GridScan(NamedTuple):
-    """Nearest things and free floor around the base, by sectors about its origin from -pi on."""
+    """Nearest obstacles and free floor around the base, by sectors about its origin from -pi on."""
 
-    ranges_m: Floats  # (SECTORS,) first thing; inf: floor up to the longest range; NaN: unknown
+    ranges_m: Floats  # (SECTORS,) first obstacle; inf: floor up to the longest range; NaN: unknown
     sigma_m: Floats  # (SECTORS,) of the ranges
     free_m: Floats  # (SECTORS,) up to which the way is free
     arrivals: Arrivals  # of this pair, about the viewpoint
@@ -141,7 +141,7 @@ class ObstacleGrid:
         self._turn_rad = math.atan2(T_rect_base[1, 0], T_rect_base[0, 0])
 
     def begin_again(self) -> None:
-        """Forget what is known, as the way since then is not, but for things nearer than the floor in view.
+        """Forget what is known, as the way since then is not, but for obstacles nearer than the floor in view.
 
         No pair would show these again, and a base whose odometry is lost stops, so that they are still about there.
         """
@@ -163,7 +163,7 @@ class ObstacleGrid:
         """Forget everything."""
         self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf], np.float32)
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
-        # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
+        # Log-odds of an obstacle; evidence of the pair before; mean of what single pairs show; whether a cell is known;
         # views past it; whether the last pair saw floor behind it; time [s] since it was free.
         self.odds, self._before, self._surface, self._known, *others = self._layers
         self._past_views, self._was_past, self._free_s = others
@@ -244,17 +244,17 @@ class ObstacleGrid:
         return np.asarray(cv2.remap(floor, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0)
 
     def _ways(self, cells: Floats, place: Array, yaw_rad: float) -> tuple[Floats, Floats, Floats]:
-        """Return the range of the first thing from a place [cells] in each sector, its sigma, and the free way [m].
+        """Return the range of the first obstacle from a place [cells] in each sector, its sigma, and the free way [m].
 
-        cells (SIDE, SIDE): probability of a thing, 2 where nothing is known.
+        cells (SIDE, SIDE): probability of an obstacle, 2 where nothing is known.
         """
         count = round(self._max_range_m / CELL_M)
         ranges_m, steps = STEPS_M[:count], np.arange(count)[:, None]
         occupied = cells.take(_along(place, yaw_rad)[:count]).astype(float)
-        # 1. Free is up to where the probability that a thing stands on the way is at most the risk.
+        # 1. Free is up to where the probability of an obstacle on the way is at most the risk.
         has_ended = 1 - np.cumprod(1 - np.minimum(occupied, 1), axis=0) > RISK
         free_m = np.where(has_ended.any(axis=0), has_ended.argmax(axis=0) * CELL_M, self._max_range_m)
-        # 2. The first cells in a row in which a thing is more likely than not.
+        # 2. The first cells in a row in which an obstacle is more likely than not.
         is_thing = (occupied > 0.5) & (occupied <= 1)
         is_beyond = ~is_thing & (steps >= is_thing.argmax(axis=0))
         end = np.where(is_beyond.any(axis=0), is_beyond.argmax(axis=0), count)
@@ -285,7 +285,7 @@ class ObstacleGrid:
     def _arrivals(self, passed_s: float, rays: Rays, occupied: Floats, shows: Flags, possible: Bytes) -> Arrivals:
         """Return what has come onto floor that was free a short while ago.
 
-        rays: of the viewpoint; occupied (SIDE, SIDE): probability of a thing; shows: this pair shows one; possible: 1
+        rays: of the viewpoint; occupied (SIDE, SIDE): of an obstacle; shows: this pair shows one; possible: 1
         where one may that hides the nearest floor.
         """
         p = self._p
@@ -370,7 +370,7 @@ class ObstacleGrid:
         return np.asarray((three > 0.5) & (belief.view[:, 0] > 0))
 
     def _things(self) -> Floats:
-        """Return the probability of a thing in cells (SIDE, SIDE), also where nothing is known."""
+        """Return the probability of an obstacle in cells (SIDE, SIDE), also where nothing is known."""
         p, (around, is_most) = self._p, self._hanging()
         hanging = np.clip(p.hanging_weight * (around - p.hanging_least), -9.0, 6.0) + np.float32(p.prior)
         hanging[~is_most] = p.least

@@ -42,7 +42,7 @@ FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian, because ima
 FINE_PX: Final = 0.8  # sigma of the smoothing along columns, because views differ by parts of a row
 AROUND_ROWS: Final = 17  # rows with which a pixel is compared
 # Difference between two views of a surface, by the local contrast; noise is added to it. Measured: with 0.2 and 0.45
-# 8.5 and 15.5 % of the directions of things are called free beyond these instead of 11.1 %.
+# 8.5 and 15.5 % of the directions of obstacles are called free beyond these instead of 11.1 %.
 TEXTURE_SHARE: Final = 0.3
 # Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
 # of 960 px 0.36 to 0.53. With 0.35, by trial, bases stood before free floor in noisy images.
@@ -56,7 +56,7 @@ BOUNDED_SIGMAS: Final = 5.5
 
 NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
 # Rows on either side of those in which the floor has a disparity. Measured: with 1, 2 and 3 of them 10.5, 11.1 and 11.8
-# % of the directions of things are called free beyond these, and 93.7, 94.9 and 95.8 % of open ones up to 1.5 m.
+# % of the directions of obstacles are called free beyond these, and 93.7, 94.9 and 95.8 % of open ones up to 1.5 m.
 BIN_ROWS: Final = 2
 # Least difference of disparity by which something is not the floor. Measured: 0.87 to 1.95 change nothing.
 FLOOR_PX: Final = 1.3

@@ -1,21 +1,21 @@
-"""Posterior of the first thing on each ray, from one pair.
+"""Posterior of the first obstacle on each ray, from one pair.
 
-Along a direction of the panoramas the world is floor up to some bin, then the first thing: upright, a step up, a step
-down, something low over whose top the floor behind is seen, something that hangs over floor in view, or nothing up to
-the last bin. Bins are half a disparity wide.
+In each direction of the panoramas the world is floor up to some bin, then the first obstacle: upright, a step up or
+down, a low one over whose top the floor behind is seen, one that hangs over floor in view, or none up to the last
+bin. Bins are half a disparity wide.
 
     log p(k, c | z) = sum_{j<k} l_j(floor) + l_k(c) + sum_{j>k} l_j(behind) + log prior(k, c)
 
 1. Steps of grey e across the bins of the floor, and its greys. Floor: (1 - m) N(e; s_r) + m Laplace(e; b g),
-   with its sigma s_r at that range and its rate of marks m; what is behind something: the same with a rate m_h, with
-   texture or without; where something begins: Laplace(e; b g). So a plain bin speaks against a beginning.
+   with its sigma s_r at that range and its rate of marks m; what is behind an obstacle: the same with a rate m_h, with
+   texture or without; where an obstacle begins: Laplace(e; b g). So a plain bin speaks against a beginning.
 2. Ratios of floor, surfaces and planes beside the floor, from stereo (plane_view.py).
 3. Look of the floor: contrast, grey and outline of a bin, by those of floor that is known. Beyond the
    border of a patch of sun, or of another covering, it may look otherwise.
 4. The posterior (ray_kernels.posterior): sums along the ray. The end of the floor beyond the last bin shows a foot,
-   too; and something may begin nearer than the view: then it hides all, shows no foot, and may show its surface.
+   too; and an obstacle may begin nearer than the view: then it hides all, shows no foot, and may show its surface.
 
-All are log-likelihood ratios to "hidden behind something".
+All are log-likelihood ratios to "hidden behind an obstacle".
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-RISK: Final = 0.1  # probability of a thing on a way that is free
+RISK: Final = 0.1  # probability of an obstacle on a way that is free
 MAD: Final = 1.48  # sigma of a normal distribution by the median of its magnitudes
 LEAST_STEP: Final = 0.35  # sigma of a step by the rounding of greys
 TYPICAL_M: Final = 1.3  # range at which the near floor is seen
@@ -49,8 +49,8 @@ ALONG_RAD: Final = math.radians(35.0)  # about ahead and behind: floor there is 
 class RayBelief(NamedTuple):
     """What one pair says of each direction of the rectified frame, about the viewpoint."""
 
-    first: Floats  # (DIRECTIONS, N + 1) probability that the first thing begins in a bin; last: nowhere
-    ratios: Floats  # (DIRECTIONS, N) log-ratio of a thing in the bin to its prior, weighted by the view of it
+    first: Floats  # (DIRECTIONS, N + 1) probability that the first obstacle begins in a bin; last: nowhere
+    ratios: Floats  # (DIRECTIONS, N) log-ratio of an obstacle in the bin to its prior, weighted by the view of it
     view: Floats  # (DIRECTIONS, N) probability that the bin's floor is in view, 0 where it is out of sight
     surface: Floats  # (DIRECTIONS, N) log-likelihood ratio of surfaces
     ends_m: Array  # (N + 1,) range at which the bins begin, from near to far, and the end of the last
@@ -124,7 +124,7 @@ def _step_sigmas(steps: Floats, near: Flags, known: Flags) -> Floats:
 
 
 def _edges(steps: Floats, greys: Floats, sigmas: Floats, marks: float, plain: float) -> tuple[Floats, ...]:
-    """Return log-ratios (N, D) to something hidden, by steps: of floor, of something plain, and of what begins.
+    """Return log-ratios (N, D) to a hidden bin, by steps: of floor, of a plain obstacle, and of its beginning.
 
     sigmas (N, 1) of steps of the floor; marks: its rate of edges; plain: sigma of steps without any texture.
     """
@@ -162,8 +162,8 @@ def _look(steps: Floats, greys: Floats, near: Flags, far: Floats) -> Floats:
     sigma = np.float32(max(_sigma_of(z[near]), 0.25))
     anything = _noise(contrast - 1, np.float32(1.3), 0.0)
     by_contrast = _ratio_of_look(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0) / anything, near)
-    # 2. The difference to both sides, of a bin or of five, whichever is less. A thing shows an outline in half of its
-    #    directions.
+    # 2. The difference to both sides, of a bin or of five, whichever is less. An obstacle shows an outline in half of
+    #    its directions.
     side = turned(greys, SIDE)
     one = greys - (side[:, : -2 * SIDE] + side[:, 2 * SIDE :]) / 2
     five = cv2.blur(one, (1, 5))

@@ -20,14 +20,14 @@ class RayParameters(NamedTuple):
 
     # Rates of the prior, per metre of a ray.
     things_per_m: float = 0.1
-    rare_per_m: float = 0.05  # of things that hang, and of slopes
+    rare_per_m: float = 0.05  # of obstacles that hang, and of slopes
     steps_per_m: float = 0.005
-    low_per_m: float = 0.02  # of low things, over whose top the floor behind is seen
-    ends_per_m: float = 2.0  # of the end of a low thing, along its top
+    low_per_m: float = 0.02  # of low obstacles, over whose top the floor behind is seen
+    ends_per_m: float = 2.0  # of the end of a low obstacle, along its top
     changes_per_m: float = 0.02  # of borders behind which the floor looks otherwise
     # Probabilities.
     similar: float = 0.1  # something looks like the floor
-    no_end: float = 0.1  # the end of a low thing shows no surface
+    no_end: float = 0.1  # the end of a low obstacle shows no surface
     invisible: float = 0.005  # the end of the floor beyond the last bin shows no foot
     nearer: float = 0.02  # something begins nearer than the view and looks like the floor; and otherwise
     marks: float = 0.02  # m: an edge in a bin of the floor, before any was seen
@@ -36,7 +36,7 @@ class RayParameters(NamedTuple):
     plain_behind: float = 0.3  # what hides the floor has no texture
     tail: float = 0.05  # a step of the floor has 2.5 times its sigma
     # Noises and scales.
-    contrast: float = 0.15  # b: of the difference of grey between a thing and the floor, by the floor's grey
+    contrast: float = 0.15  # b: of the difference of grey between an obstacle and the floor, by the floor's grey
     surface_noise: float = 0.4  # of the best surface where there is none [nats]
     noise_share: float = 0.4  # sigma of a step by noise alone, by the noise of a pixel of both views
     grey_share: float = 0.06  # least sigma of the floor's grey, by the grey,
@@ -97,11 +97,11 @@ def posterior(
     ratios: Floats,
     view: Floats,
 ) -> None:
-    """Write the probability (D, N + 1) that the first thing of a ray begins in a bin, last: nowhere; and for the grid
+    """Write the probability (D, N + 1) that a ray's first obstacle begins in a bin, last: nowhere; and for the grid
     (D, N) the log-ratio of each bin to its prior, and the probability that the ray comes there.
 
-    terms (8, N, D): log-likelihood ratios to something hidden, of floor by stereo, less those of planes above and
-    below, of the look of floor, of floor and of something plain by edges, of what begins by its edge, and of surfaces.
+    terms (8, N, D): log-likelihood ratios to a hidden bin, of floor by stereo, less those of planes above and
+    below, of the look of floor, of floor and of a plain obstacle by edges, of a beginning by its edge, and of surfaces.
     lengths_m (N,) of the bins; far_edges (D,): sigmas of the largest step beyond the last bin; near_surfaces (D,):
     log-likelihood ratios of the best surface nearer than the first; nearest_m: range of the nearest floor in view.
     """
@@ -129,7 +129,7 @@ def posterior(
     log_known, log_other = math.log1p(-other_at_start), math.log(other_at_start)
     log_nearer, log_nearest, log_2 = math.log(p.nearer), math.log(nearest_m), math.log(2.0)
     for u in range(directions):
-        # 1. Sums from each bin to the last: planes beside the floor, look, and things behind the first one.
+        # 1. Sums from each bin to the last: planes beside the floor, look, and obstacles behind the first one.
         plain = 0.0
         for n in range(bins - 1, -1, -1):
             plain += terms[BARE, n, u]
@@ -200,7 +200,7 @@ def posterior(
         for n in range(bins):
             found = total[n] / weight
             first[u, n] = found if n else found + hidden
-            # 9. For the grid: log-ratio of a thing here, where the ray comes, to its prior.
+            # 9. For the grid: log-ratio of an obstacle here, where the ray comes, to its prior.
             ratios[u, n], view[u, n] = 0.0, reach
             if reach > LEAST_REACH:
                 rate = min(max(found / reach, 1e-6), 1.0 - 1e-6)
@@ -262,7 +262,7 @@ def gather(
                     state = near[u % directions]
                     hidden += state == 2
                     past += state == 1
-                # The thinnest thing there would hide so many directions.
+                # The thinnest obstacle there would hide so many directions.
                 if hidden >= min(0.6 * THIN_M / r * by_angle, last - first + 1.0):
                     states[i, j] = HIDDEN
                 elif past + hidden == last - first + 1:
@@ -270,7 +270,7 @@ def gather(
                 continue
             if end >= bins:
                 continue
-            # A thin thing hides so many directions together: their mean counts, as one alone is noise.
+            # A thin obstacle hides so many directions together: their mean counts, as one alone is noise.
             run = max(min(round(THIN_M / r * by_angle), last - first + 1), 1)
             most, least, total, together, seen = -99.0, 1.0, 0.0, 0.0, 0
             for u in range(first, last + 1):

@@ -1,4 +1,4 @@
-"""Scan of free floor and things of each pair: stereo, posterior of the rays, grid; over a floor that leans, and ramps.
+"""Scan of free floor and obstacles by each pair: posterior of the rays, grid; a floor that leans, and ramps.
 
 A tilt (a, b) of the floor beyond that which the rig states changes the disparity of all its rows by
 f t / h (a cos u + b sin u), whatever their range. So the difference of both views on the plane, by the gradient along
@@ -12,7 +12,7 @@ the floor, and than anything upright, in most directions: what is narrower than 
 neither is a wall.
 A ramp goes up by at most what may be driven; and down by at most what the base has climbed: a landing. Any other fall
 is an edge.
-While a base drives over the line it stands on neither plane: then its own pose says where both are.
+While a base drives over the line it is on neither plane: then its own pose says where both are.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def ramp_ahead(pair: WorkingPair, view: PlaneView, viewpoint: Array, turn_rad: f
     by_gain = 2 * RATIO / UNITS * PARTS  # nats. Every second direction was looked at.
     if by_gain * np.median(gains, axis=0).max() < LEAST_NATS:  # as nearly always
         return None
-    # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
+    # 2. Those of the best upright obstacle in the same rows of each part, from the farthest of a ramp to its start.
     sums = np.pad(np.cumsum(upright, axis=2), ((0, 0), (0, 0), (1, 0)))
     below_m = height_m + np.outer(STARTS_M, slopes)
     far = np.ceil(view.row0 + FOCAL_PX * (below_m / SEEN_M - slopes)).astype(int)
