@@ -32,18 +32,16 @@ class OdometryLimits:
     # pose is degraded
     good_inlier_ratio: float = 0.6
     max_speed_mps: Annotated[float, Meta(ge=0.1, le=100), "poses that imply a higher speed are refused, m/s"] = 5.0
-    lost_s: float = 0.15  # time from the first of consecutive refused frames after which the state is lost, s
-    # time from the first frame with enough corners that matches no landmark while lost, after which the map is
-    # started again, s
-    restart_s: float = 0.85
+    restart_s: float = 1.05  # time of frames with texture that matched nothing, after which the map is started again, s
     max_gap_s: Annotated[float, Meta(ge=0.01, le=60), "a pose after a longer time without frames is degraded, s"] = 0.5
     bridge_s: Annotated[
         float,
         Meta(ge=0, le=600),
-        "longest time for which wheels and gyro carry the pose on while the cameras show "
-        "nothing, as degraded; 0: never, s",
+        "time after which the pose is lost while the cameras show nothing, although wheels and gyro carry it on, s",
     ] = 10.0
-    bridge_sigma_m: float = 0.15  # uncertainty of the position that ends that, standard deviation
+    # growth of the position's standard deviation since the cameras found it, above which the pose is lost: that of a
+    # quarter of a second that nothing measures
+    bridge_sigma_m: float = 0.125
 
 
 Array = NDArray[np.float64]

@@ -61,7 +61,8 @@ SLIPPING, MOST_OUTLIERS = 2, 40
 class MotionFilter:
     """The filter; without samples of wheels and gyro that of the paper.
 
-    slips counts steps in which the wheels moved otherwise than the cameras; refused, those of the gyro.
+    slips counts steps in which the wheels moved otherwise than the cameras; refused, those of the gyro. since_found_s
+    and grown_m2 are the time, and the growth of the position's variance, since the cameras found a pose.
     """
 
     def __init__(self, jerk_psd: tuple[float, float] = JERK_PSD, T_base_rect: Array | None = None) -> None:
@@ -79,8 +80,7 @@ class MotionFilter:
         self._outliers: dict[type[MotionSample], int] = {WheelSample: 0, GyroSample: 0}
         self._disagreements = 0  # consecutive steps in which the turns of wheels and gyro differ
         self._before_sensing = self._filter.x, self._filter.P
-        self._bridged_s = self._bridged_m2 = 0.0  # time and variance of the position since the cameras found it
-        self._is_over = False  # they are beyond the limits: wheels and gyro are left out until then
+        self.since_found_s = self.grown_m2 = 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -164,7 +164,7 @@ class MotionFilter:
         # 1. What wheels and gyro say is a measurement of the filter. Wheels whose turn differs from that of the gyro
         #    twice in a row slip, as those that the cameras contradict, and are left out.
         values, wheels, gyro = self.values, Twist(), Twist()
-        if interval_s is not None and dt_s > 0 and not self._is_over:
+        if interval_s is not None and dt_s > 0:
             gyro = self.sensors.measured(GyroSample, interval_s, values)
             if self.wheels_are_sane and not self.is_slipping:
                 wheels = self.sensors.measured(WheelSample, interval_s, values)
@@ -220,39 +220,40 @@ class MotionFilter:
             self.reset()
         self._filter.P[POSE] = self._filter.P[:, POSE] = 0.0
         self._filter.P[POSE, POSE] = covariance
-        self._bridged_s, self._bridged_m2, self._is_over = 0.0, 0.0, False
+        self.since_found_s = self.grown_m2 = 0.0
 
-    def carry(self, dt_s: float, *, is_measured: bool, most_s: float, most_sigma_m: float) -> bool:
-        """Move the pose's covariance on by the last step; return whether wheels and gyro carry the pose.
+    def carry(self, dt_s: float, *, is_measured: bool) -> None:
+        """Move the pose's covariance on by the last step, in which the cameras found no pose.
 
-        They do until the limits of time and of the growth of its uncertainty. Beyond, the velocity is not known.
+        is_measured: by wheels and gyro; else the velocity is not known.
         """
         self._last_step = None
-        if is_measured:
-            moved = self._moved(dt_s)
-            self._bridged_s += dt_s
-            self._bridged_m2 += float(np.diag(moved - self._filter.P)[POSE][:3].max())
-            self._is_over = self._bridged_s > most_s or self._bridged_m2 > most_sigma_m**2
-            if not self._is_over:
-                self._filter.P = moved
-                return True
-        if not self._is_unknown:
-            self._is_unknown = True
-            self._set_covariance(slice(0, 12), np.repeat([UNKNOWN_SPEED_SIGMA**2, 0.0], 6))
-        self._filter.P = bounded(self._moved(dt_s), POSE)
-        self._filter.x[:12] *= math.exp(-dt_s / SLOWING_S)
-        return False
-
-    def distrust(self, covariance: Array) -> None:
-        """Add a covariance (6, 6) to that of the pose, for what is not measured."""
-        self._filter.P[POSE, POSE] += covariance
-
-    def _moved(self, dt_s: float) -> Array:
-        """Return the covariance after a step: e <- Ad(exp(-v dt)) e + dt v_error."""
+        if not is_measured:
+            self._forget_velocity()
+        # e <- Ad(exp(-v dt)) e + dt v_error
         F = np.eye(SIZE)
         F[POSE, POSE] = se3.adjoint(se3.exp(-self.velocity * dt_s))
         F[POSE, VELOCITY] = dt_s * np.eye(6)
-        return np.asarray(F @ self._filter.P @ F.T)
+        moved = F @ self._filter.P @ F.T
+        self.since_found_s += dt_s
+        self._grow((moved - self._filter.P)[POSE, POSE])
+        self._filter.P = bounded(moved, POSE)
+        if not is_measured:
+            self._filter.x[:12] *= math.exp(-dt_s / SLOWING_S)
+
+    def distrust(self, covariance: Array) -> None:
+        """Add a covariance (6, 6) to that of the pose, for a motion that nothing has measured; nor is the velocity."""
+        self._filter.P[POSE, POSE] += covariance
+        self._grow(covariance)
+        self._forget_velocity()
+
+    def _grow(self, covariance: Array) -> None:
+        self.grown_m2 += float(np.diag(covariance)[:3].max())
+
+    def _forget_velocity(self) -> None:
+        if not self._is_unknown:
+            self._is_unknown = True
+            self._set_covariance(slice(0, 12), np.repeat([UNKNOWN_SPEED_SIGMA**2, 0.0], 6))
 
     def _differ(self, wheels: Twist, gyro: Twist) -> bool:
         """True if wheels and gyro measure turns in a step that differ by more than their errors."""

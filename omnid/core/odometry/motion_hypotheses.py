@@ -82,7 +82,7 @@ class OtherMotion:
         # 2. The candidate farthest from it is the other motion. Where the images decide against what was predicted, the
         #    doubt goes on: that one is as far, and sought there.
         if self.is_open and chosen.distance_m(T_predicted) > REACH_SIGMAS * sigma_mps * dt_s:
-            self._past, self._displacement = self._past + self._displacement, np.zeros(6)
+            self.keep()
         others = [each for each in likely if each.distance_m(chosen.T_odom_rect) > SAME_M]
         if others:
             off_m = self._displacement[:3] - chosen.T_odom_rect[:3, 3]
@@ -101,9 +101,13 @@ class OtherMotion:
         """Move the other motion on by its velocity, at a frame that does not show it."""
         self._displacement = self._displacement + dt_s * np.pad(self.velocity, (0, 3))
 
+    def keep(self) -> None:
+        """Let the displacement stay in the covariance, whatever follows."""
+        self._past, self._displacement = self._past + self._displacement, np.zeros(6)
+
     def agree(self) -> None:
         """End the doubt: wheels measure the step, whatever was made before."""
-        self._past = self._past + self._displacement
+        self.keep()
         self._end()
 
     def _end(self) -> None:

@@ -3,14 +3,14 @@
 VisualOdometry.process is the algorithm, one frame at a time. Equations and sections are those of Dang et al. 2012.
 
 A pose by the cameras is TRACKING; DEGRADED with few inliers, few of them in the upper camera, with more than one
-hypothesis of the motion, after a gap or a refused frame, or by images that are broken. A frame without one is DEGRADED
-while wheels and gyro carry the pose, and for lost_s after the first such frame; then it is LOST. The map is started
-again when textured frames have matched nothing for restart_s, or one was recognised elsewhere.
+hypothesis of the motion, after a gap or a refused frame, or by images that are broken. A frame without one is
+predicted: DEGRADED until the position's uncertainty has grown by bridge_sigma_m since the last fix, which wheels and
+gyro delay by bridge_s at most, and then LOST. The map is started again when frames with texture have matched nothing
+for restart_s, or one was recognised elsewhere; where the pose is LOST, the reset counter rises.
 
-The motion since the last fix is unknown from the first frame on to which wheels and gyro carried nothing, or that was
-recognised elsewhere. It is unknown, too, where a map is started again although they say that the base has hardly
-moved: the old map would be in view, so the base was carried away, or its wheels and gyro are wrong. A map that is
-started after an unknown motion is DEGRADED at first, and the reset counter rises.
+What contradicts the prediction is in the covariance: the gap to where a frame was recognised, and any motion where a
+map is started again although wheels and gyro say that the base has hardly moved. The old map would be in view, so the
+base was carried away, or they are wrong.
 """
 
 from __future__ import annotations
@@ -109,10 +109,7 @@ class VisualOdometry:
         self._error = np.zeros((6, 0))  # [t; r] of it, by the draws of the keyframes and one of its own
         self._state, self._resets = TrackingState.LOST, 0  # resets: odom lost its relation to what was published
         self._T_at_fix: Array | None = None  # the last accepted pose; None: there was no map yet
-        self._since_fix_s = 0.0
-        self._is_unknown = False  # nothing measured the whole motion since the last fix
-        self._refused_s: float | None = None  # since the first of consecutive refused frames; None: it was accepted
-        self._unmatched_s: float | None = None  # since the first textured one of them after lost_s
+        self._unmatched_s = 0.0  # of frames that were searched in vain since
         self._first: _Prediction | None = None  # started the map before its velocity was known
         self._step: Array | None = None  # last step by the cameras
         self._add_keyframe: Callable[[], None] | None = None  # the keyframe that the last frame asked for
@@ -157,23 +154,24 @@ class VisualOdometry:
 
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some;
         #    only they know a long gap.
-        T_prev_curr, is_measured = self._motion.step(frame.interval_s, dt_s, limits.max_gap_s)
+        interval_s = None if self._is_lost else frame.interval_s
+        T_prev_curr, is_measured = self._motion.step(interval_s, dt_s, limits.max_gap_s)
         now = _Prediction(
             replace(frame, usable=self._static_mask.without(frame.usable)),
             dt_s,
-            max(dt_s, SHORTEST_STEP_S) + self._since_fix_s,
+            max(dt_s, SHORTEST_STEP_S) + self._motion.since_found_s,
             self._T_odom_rect @ T_prev_curr,
             math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1])),
             is_measured,
             self._exposure(frame, dt_s),
         )
         if self._map.last is None:
-            return self._start_map(now, carried=dt_s > 0 and self._carry(now))
+            self._carry(now)
+            return self._start_map(now)
 
         # 2. to 4. Track, estimate and refine: pose_search.py. Once a frame was refused, those without corners
         #    (darkness, a blank wall) are left out to save time.
-        after_refusal = self._refused_s is not None
-        searched = not after_refusal or self._is_textured(now)
+        searched = not self._was_refused or self._is_textured(now)
         found = self._find(now) if searched else []
         first, self._first = self._first, None
         if first is not None and found and 0 < dt_s <= limits.max_gap_s and self._is_plausible(found[0], now):
@@ -183,19 +181,19 @@ class VisualOdometry:
         #    relocalise, also where there are too few inliers to be relied on after an unknown motion.
         plausible = [each for each in found if self._is_plausible(each, now)]
         is_too_fast = bool(found) and not plausible and found[0].has_support(limits)
-        if searched and (after_refusal or dt_s > limits.max_gap_s):
+        if searched and (self._was_refused or dt_s > limits.max_gap_s):
             relied = min(limits.good_inliers, limits.min_inlier_ratio * plausible[0].visible) if plausible else 0.0
             if not plausible or plausible[0].inliers < relied:
                 recognised = self.relocalise(now.frame, now.exposure)
                 plausible = [recognised] if recognised is not None and self._is_plausible(recognised, now) else []
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
-        gap = _step(now.T_odom_rect, plausible[0].T_odom_rect) if plausible and after_refusal else np.zeros(6)
+        gap = _step(now.T_odom_rect, plausible[0].T_odom_rect) if plausible and self._was_refused else np.zeros(6)
         if not plausible or np.linalg.norm(gap[:3]) > JUMP_M:
             self._other.predict(dt_s)
             if is_too_fast:  # the vehicle may be as fast
                 self._other.replace(now.T_odom_rect, found[0].T_odom_rect, now.since_fix_s)
             is_known = bool(plausible) and plausible[0].inliers >= limits.good_inliers
-            return self._refuse(now, found, gap if is_known else None)
+            return self._refuse(now, found, gap if is_known else None, searched=searched)
         estimate = self._other.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
         estimate = self._at_rest(estimate)
 
@@ -223,7 +221,7 @@ class VisualOdometry:
             self._other.agree()
         found = self._search.find(now.frame, self._T_odom_rect, now.T_odom_rect, now.exposure)
         # After a refused frame the displacements from an unknown place lead anywhere: relocalisation decides.
-        if found is None or self._refused_s is not None:
+        if found is None or self._was_refused:
             return [] if found is None else [found]
         most_mps = REACH_SIGMAS * now.sigma_mps + float(np.linalg.norm(self._other.velocity))
         reach_m = min(most_mps, self._limits.max_speed_mps) * now.since_fix_s
@@ -264,7 +262,7 @@ class VisualOdometry:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""
         # 1. Whether many landmarks support the pose, or nearly all of few all around: they are no single moving object.
         limits, at_previous = self._limits, None
-        is_after_gap = self._refused_s is not None or now.dt_s > self._limits.max_gap_s
+        is_after_gap = self._was_refused or now.dt_s > self._limits.max_gap_s
         parts = np.unique(np.floor(estimate.pixels[:, 0] * (AROUND / self._model.cylinder.period_px)) % AROUND)
         is_all = estimate.least_ratio >= NEARLY_ALL and len(parts) >= AROUND / 2
         is_sure = not self._other.is_open and (estimate.inliers >= limits.good_inliers or is_all)
@@ -281,7 +279,6 @@ class VisualOdometry:
             self._motion.reset()
         self._map.settle(at_previous)
         self._error = np.hstack([self._map.error_of(estimate), _root(estimate.covariance)])
-        self._motion.found(self._error @ self._error.T)
         # 3. The pose and its state.
         self._T_odom_rect = estimate.T_odom_rect
         # What the upper camera does not show where it must be is an outlier there.
@@ -289,76 +286,76 @@ class VisualOdometry:
         away = self._map.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
         self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
         is_doubtful = not is_sure or estimate.upper_ratio < limits.good_inlier_ratio or is_after_gap
-        self._fix(is_doubtful=is_doubtful, is_reset=is_reset)
+        self._fix(self._error @ self._error.T, is_doubtful=is_doubtful, is_reset=is_reset)
         self._static_mask.observe(now.frame.lower.panorama, self._T_odom_rect)
 
-    def _fix(self, *, is_doubtful: bool, is_reset: bool) -> None:
-        """Set the state of a pose that was accepted, or at which a map was started."""
+    def _fix(self, covariance: Array, *, is_doubtful: bool, is_reset: bool) -> None:
+        """Set covariance and state of a pose that was accepted, or at which a map was started."""
+        self._motion.found(covariance)
         self._state = TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING
         self._resets += is_reset
-        self._T_at_fix, self._since_fix_s, self._is_unknown = self._T_odom_rect, 0.0, False
-        self._refused_s = self._unmatched_s = None
+        self._T_at_fix, self._unmatched_s = self._T_odom_rect, 0.0
 
-    def _refuse(self, now: _Prediction, found: list[PoseEstimate], gap: Array | None) -> OdometryEstimate:
+    @property
+    def _was_refused(self) -> bool:
+        """True if the last frame was."""
+        return self._motion.since_found_s > 0
+
+    @property
+    def _is_lost(self) -> bool:
+        """True if the position is not known well enough since the last fix."""
+        limits, motion = self._limits, self._motion
+        return motion.grown_m2 > limits.bridge_sigma_m**2 or motion.since_found_s > limits.bridge_s
+
+    def _refuse(
+        self, now: _Prediction, found: list[PoseEstimate], gap: Array | None, *, searched: bool
+    ) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
-        found: poses that were not accepted. gap (6,): step from the predicted pose to the one that was recognised
-        elsewhere; None: it was not.
+        found: poses that were not accepted; searched: the frame was searched for them. gap (6,): step from the
+        predicted pose to the one that was recognised elsewhere; None: it was not.
         """
         # 1. Go on to the predicted pose. Of a gap without frames no more than max_gap_s counts, because nothing could
         #    be seen in it.
-        limits, step_s = self._limits, min(now.dt_s, self._limits.max_gap_s)
-        carried = self._carry(now) and gap is None
-        self._is_unknown |= not carried
-        self._refused_s = 0.0 if self._refused_s is None else self._refused_s + step_s
-        is_lost = self._refused_s >= limits.lost_s
-        if is_lost and self._is_textured(now):
-            self._unmatched_s = 0.0 if self._unmatched_s is None else self._unmatched_s + step_s
-        is_unmatched = self._unmatched_s is not None and self._unmatched_s >= limits.restart_s
-        restarts = is_lost and (gap is not None or is_unmatched)
-        self._state = TrackingState.LOST if is_lost and not carried else TrackingState.DEGRADED
-        if not restarts:
-            return self._result(0, 0, self._exposure(now.frame))
-        # 2. Whether wheels and gyro, which say that the old map is in view, are contradicted: most of the tracks, few
-        #    as they may be, do not show it there. Then they have measured nothing since the last fix.
-        if not self._is_unknown and self._T_at_fix is not None and _keeps_view(self._T_at_fix, now.T_odom_rect):
-            is_shown = bool(found) and found[0].inlier_ratio > 0.5
-            if not (is_shown and _keeps_view(now.T_odom_rect, found[0].T_odom_rect)):
-                self._is_unknown = True
-                self._motion.distrust((UNKNOWN_SPEED_SIGMA * self._since_fix_s) ** 2 * np.eye(6))
-        # 3. Start the map again.
-        self._map.clear()
-        self._relocaliser.clear()
+        limits = self._limits
+        self._carry(now)
+        if searched:
+            self._unmatched_s += min(now.dt_s, limits.max_gap_s)
+        assert self._T_at_fix is not None  # as there is a map
+        # 2. What the frame says about the motion since the last fix: the gap, or, as the old map is not in view, that
+        #    wheels and gyro are wrong if they say so. Most of the tracks, few as they may be, do not show it there.
         if gap is not None:
             self._motion.distrust(np.outer(gap, gap))
-        if self._is_unknown:
-            self._motion.reset()
-        return self._start_map(now, carried=carried, is_elsewhere=gap is not None)
+        elif self._unmatched_s < limits.restart_s:
+            return self._result(0, 0, self._exposure(now.frame))
+        elif not self._is_lost and _keeps_view(self._T_at_fix, now.T_odom_rect):
+            is_shown = bool(found) and found[0].inlier_ratio > 0.5
+            if not (is_shown and _keeps_view(now.T_odom_rect, found[0].T_odom_rect)):
+                self._motion.distrust((UNKNOWN_SPEED_SIGMA * self._motion.since_found_s) ** 2 * np.eye(6))
+        # 3. Start the map again. Another motion that led here stays in the covariance.
+        self._other.keep()
+        self._map.clear()
+        self._relocaliser.clear()
+        return self._start_map(now)
 
-    def _carry(self, now: _Prediction) -> bool:
-        """Go on to the predicted pose; return whether wheels and gyro carry it."""
-        limits, self._T_odom_rect = self._limits, now.T_odom_rect
-        carried = self._motion.carry(
-            now.dt_s, is_measured=now.is_measured, most_s=limits.bridge_s, most_sigma_m=limits.bridge_sigma_m
-        )
-        self._since_fix_s += now.dt_s
-        self._is_unknown |= self._T_at_fix is not None and not carried
-        return carried
+    def _carry(self, now: _Prediction) -> None:
+        """Go on to the predicted pose."""
+        self._T_odom_rect = now.T_odom_rect
+        self._motion.carry(now.dt_s, is_measured=now.is_measured)
+        self._state = TrackingState.LOST if self._is_lost or self._T_at_fix is None else TrackingState.DEGRADED
 
-    def _start_map(self, now: _Prediction, *, carried: bool, is_elsewhere: bool = False) -> OdometryEstimate:
-        """Start a map at the current pose if the frame has enough landmarks."""
-        exposure = self._exposure(now.frame)
-        self._error = _root(self._motion.pose_covariance)
+    def _start_map(self, now: _Prediction) -> OdometryEstimate:
+        """Start a map at the predicted pose if the frame has enough landmarks."""
+        exposure, covariance = self._exposure(now.frame), self._motion.pose_covariance
+        self._error = _root(covariance)
         self._make_keyframe(now, exposure)
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
-            self._refused_s = self._unmatched_s = None
-            self._state = TrackingState.DEGRADED if carried else TrackingState.LOST
             return self._result(0, 0, exposure)
         self._first = None if now.frame.times.is_synchronised else now
-        self._motion.found(self._motion.pose_covariance)
         # A map that replaces a lost one says nothing about the motion between the two.
-        self._fix(is_doubtful=self._is_unknown and not is_elsewhere, is_reset=self._is_unknown)
+        is_again = self._T_at_fix is not None
+        self._fix(covariance, is_doubtful=is_again, is_reset=is_again and self._is_lost)
         return replace(self._result(len(self._map), len(self._map), exposure), is_keyframe=True)
 
     def _make_keyframe(self, now: _Prediction, exposure: Exposure, seen: PoseEstimate | None = None) -> None:
