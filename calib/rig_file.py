@@ -10,7 +10,8 @@ from __future__ import annotations
 import base64
 import binascii
 import os
-from collections.abc import Mapping
+import struct
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -24,7 +25,7 @@ from calib import se3
 from calib.atomic_file import replacement
 from calib.errors import CalibError, within
 from calib.models.camera import Mask, OmniCamera
-from calib.models.names import MODELS, camera_of, is_coefficient, model_name, names_of, values_of
+from calib.models.names import MODELS, camera_of, model_name, names_of, values_of
 from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import DECIMALS, SIDES, TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
@@ -34,6 +35,8 @@ from calib.validation import read_bytes, require_image_size, transform_of
 # Version of the file and of its table [covariance]: it rises when an earlier program would misread them.
 SCHEMA: Final = 1
 EMBEDDED: Final = "data:image/png;base64,"
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_PNG_HEAD: Final = struct.Struct(">8s8xII")  # signature, width, height (PNG 1.2, 4.1.1)
 
 # 1. The tables of the file.
 Size: TypeAlias = tuple[int, int]
@@ -131,7 +134,7 @@ def parse_rig(text: str | bytes, name: str = "rig.toml") -> Rig:
             upper,
             np.eye(4) if table.T_base_rig is None else transform_of(table.T_base_rig, "T_base_rig"),
             (table.lower.topic, table.upper.topic),
-            None if table.covariance is None else _covariance(table.covariance, table),
+            None if table.covariance is None else _covariance(table.covariance, (lower, upper)),
             table.times,
         )
 
@@ -186,25 +189,25 @@ def _mask_image(source: str, size: Size) -> NDArray[np.uint8]:
         data = base64.b64decode(source[len(EMBEDDED) :], validate=True)
     except (binascii.Error, ValueError):
         raise CalibError("expected base64 after its prefix") from None
+    # The size is checked before the image is unpacked: a short file may be a gigabyte of pixels.
+    signature, *found = _PNG_HEAD.unpack_from(data.ljust(_PNG_HEAD.size))
+    if signature == _PNG and tuple(found) != size:
+        raise CalibError(f"expected {size} pixels (width, height) like the camera's images, found {tuple(found)}")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if signature == _PNG else None
     except cv2.error:
         image = None
-    if image is None:
+    if image is None or image.shape[::-1] != size:
         raise CalibError("expected an image")
-    if image.shape[::-1] != size:
-        raise CalibError(f"expected {size} pixels (width, height) like the camera's images, found {image.shape[::-1]}")
     return image.astype(np.uint8, copy=False)
 
 
-def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
+def _covariance(table: CovarianceTable, cameras: Sequence[MountedCamera]) -> RigCovariance:
     """Return the covariance of the parameters of both cameras and of the transform between them."""
     _require_version("covariance.version", table.version)
     known, names = {*TRANSFORM_NAMES}, table.parameters
-    for side, camera in (("lower", rig.lower), ("upper", rig.upper)):
-        known |= {f"{side} {name}" for name in names_of(camera.model)}
-        if camera.model == "ocam":
-            known |= {name for name in names if name.startswith(f"{side} ") and is_coefficient(name.split()[-1])}
+    for side, mounted in zip(SIDES, cameras, strict=True):
+        known |= {f"{side} {name}" for name in values_of(mounted.camera)}
     if not names or not known.issuperset(names):
         raise CalibError(
             "covariance.parameters: expected names of the cameras' parameters and of the transform's, found "

@@ -54,11 +54,13 @@ class OcamCamera:
     _angles: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if not 1 <= len(self.polynomial) <= 32:  # their roots are those of a square matrix
+            raise CalibError(f"ocam camera: expected 1 to 32 coefficients, found {len(self.polynomial)}")
         parts = (self.polynomial, self.center_row_column, self.affine, self.tangential, self.astigmatism)
         values = [value for part in (*parts, self.wavefront) for value in part]
         c, d, e = self.affine
         with np.errstate(all="ignore"):
-            values.append(float(self.height_and_slope(np.hypot(*self.size))[0]) if self.polynomial else np.nan)
+            values.append(float(self.height_and_slope(np.hypot(*self.size))[0]))
         if not (
             np.isfinite(values).all()
             and self.polynomial[0] < 0

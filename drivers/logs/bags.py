@@ -7,21 +7,26 @@ that a killed recorder leaves next to it is used. A bag of ROS 1 that was cut mu
 
 from __future__ import annotations
 
+import bz2
 import os
 import sqlite3
 from functools import lru_cache, partial
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from struct import Struct
 from typing import Final
 from urllib.parse import quote
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 from rosbags.rosbag1 import Reader
+from rosbags.rosbag1.reader import IndexData, ReaderError, decompressors
 from rosbags.typesys import Stores
 
 from drivers.errors import DriverError, RecordError, one_line
 from drivers.logs.log import ENTRY, KEPT_CHUNKS, MAX_RECORD_BYTES, Entries, LogFile, Topic
-from drivers.logs.ros_messages import STAMPED_TYPES, typestore
+from drivers.logs.ros_messages import CDR, HEADER, STAMPED_TYPES, typestore
 
 # A file that is shorter than it states is read up to its end with a writable schema only; it is opened read-only.
 _PRAGMAS: Final = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "writable_schema = ON")
@@ -95,6 +100,28 @@ class SqliteBag(LogFile):
         self._bag.close()
 
 
+class _IndexReader(Reader):
+    """The index of a bag of ROS 1, refused where chunks share its records: a short file could list any number."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._left = path.stat().st_size  # bytes of index records that may still be read
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
+        """Add the messages of the index record at the place of the file."""
+        assert self.bio
+        begin = self.bio.tell()
+        super().read_index_data(pos, indexes)
+        self._left -= self.bio.tell() - begin
+        if self._left < 0:
+            raise ReaderError("its index has more bytes than the file")
+
+
+# rosbags' functions unpack without a bound; by these, the classes that have one.
+_UNPACKERS: Final = {
+    decompressors["bz2"]: bz2.BZ2Decompressor,
+    decompressors["lz4"]: lz4.frame.LZ4FrameDecompressor,
+}
 _LENGTH: Final = Struct("<I")  # of the head of a record, and of its data, before each (wiki.ros.org/Bags/Format/2.0)
 
 
@@ -105,7 +132,7 @@ class Ros1Bag(LogFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._bag = Reader(path)
+        self._bag = _IndexReader(path)
         try:
             self._bag.open()
             self._file = path.open("rb", buffering=0)
@@ -124,35 +151,52 @@ class Ros1Bag(LogFile):
             for place in found
         )
         found = []
-        for block, offset, channel, time_ns in sorted(places):
+        for block, messages in groupby(sorted(places), itemgetter(0)):
             try:
-                header_ns = self.header_ns(channel, self.read(channel, block, offset))
-                found.append((channel, time_ns, header_ns, block, offset))
+                self._chunk(block)  # once, as what does not unpack may take long
             except RecordError as error:
-                self.faults.setdefault(block, str(error))
+                self.faults[block] = str(error)
+                continue
+            for _, offset, channel, time_ns in messages:
+                try:
+                    # Sequence, seconds and nanoseconds: as in CDR, which begins with the byte order instead.
+                    header_ns = self.header_ns(channel, CDR + self._message(block, offset)[len(CDR) : HEADER.size])
+                    found.append((channel, time_ns, header_ns, block, offset))
+                except RecordError as error:
+                    self.faults.setdefault(block, str(error))
         return np.array(found, ENTRY)
 
     def read(self, channel: int, block: int, offset: int) -> memoryview:
         """Return the bytes of the message of an entry, in CDR those of STAMPED_TYPES; raise RecordError for others."""
+        kind, message = self.topics[channel].kind, self._message(block, offset)
+        try:
+            return typestore(Stores.ROS2_HUMBLE).ros1_to_cdr(message, kind) if kind in STAMPED_TYPES else message
+        except Exception as error:  # of any kind, as it trusts the lengths in the bytes
+            raise RecordError(f"the chunk at byte {block}: a {kind} at its byte {offset} is not valid") from error
+
+    def _message(self, block: int, offset: int) -> memoryview:
+        """Return the bytes of a message as ROS 1 writes them; raise RecordError where it is not whole."""
         data = self._chunk(block)
         for _ in ("head", "data"):
             size = int.from_bytes(data[offset : offset + _LENGTH.size], "little")
             begin, offset = offset + _LENGTH.size, offset + _LENGTH.size + size
         if not begin < offset <= len(data):
             raise RecordError(f"the chunk at byte {block}: the message at its byte {offset} is not whole")
-        kind, message = self.topics[channel].kind, data[begin:offset]
-        try:
-            return typestore(Stores.ROS2_HUMBLE).ros1_to_cdr(message, kind) if kind in STAMPED_TYPES else message
-        except Exception as error:  # of any kind, as it trusts the lengths in the bytes
-            raise RecordError(f"the chunk at byte {block}: a {kind} at its byte {begin} is not valid") from error
+        return data[begin:offset]
 
     def _unpacked(self, block: int) -> memoryview:
-        """Return the content of a chunk; raise RecordError where it does not unpack."""
+        """Return the content of a chunk; raise RecordError where it does not unpack, or to too much."""
         chunk = self._bag.chunks[block]
         try:
-            return memoryview(chunk.decompressor(os.pread(self._file.fileno(), chunk.datasize, chunk.datapos)))
+            data = os.pread(self._file.fileno(), min(chunk.datasize, MAX_RECORD_BYTES), chunk.datapos)
+            if chunk.decompressor in _UNPACKERS:
+                unpacker = _UNPACKERS[chunk.decompressor]()
+                data = unpacker.decompress(data, max_length=MAX_RECORD_BYTES)
+                if not unpacker.eof:
+                    raise RecordError(f"it is cut, or unpacks to more than {MAX_RECORD_BYTES} bytes")
         except Exception as error:  # of any kind that a decompressor or a closed file raises
-            raise RecordError(f"the chunk at byte {block}: it does not unpack") from error
+            raise RecordError(f"the chunk at byte {block}: it does not unpack: {one_line(error)}") from error
+        return memoryview(data)
 
     def close(self) -> None:
         """Close the file; may be called twice."""

@@ -21,14 +21,14 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import DriverError, RecordError
-from drivers.logs.log import ENTRY, LATEST_NS, Entries, LogFile, Topic
+from drivers.logs.log import ENTRY, LATEST_NS, MAX_RECORD_BYTES, Entries, LogFile, Topic
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 # Images of boards, which OpenCV reads; those of a log have one of SUFFIXES.
 IMAGE_SUFFIXES: Final = frozenset({*SUFFIXES, ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
-_LISTS: Final = ("times.txt", "timestamps.txt")
+STAMP_LISTS: Final = ("times.txt", "timestamps.txt")
 _NANOSECONDS: Final = re.compile(r"\d{16,19}")
 
 
@@ -65,6 +65,8 @@ class ImageFolder(LogFile):
         """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable."""
         _, stamp_ns, path = self._images[offset]
         try:
+            if path.stat().st_size > MAX_RECORD_BYTES:
+                raise RecordError(f"{str(path)!r} has more than {MAX_RECORD_BYTES} bytes")
             return compressed_image(stamp_ns, path.read_bytes())
         except OSError as error:
             raise RecordError(f"{str(path)!r} cannot be read: {error.strerror}") from error
@@ -83,13 +85,14 @@ def _stamped(folder: Path) -> list[tuple[int, Path]]:
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name) and path.is_file()), key=_numbers_of)
     # A whole number of fewer digits is no time.
     texts = [path.stem if "." in path.stem or _NANOSECONDS.fullmatch(path.stem) else "" for path in paths]
-    lists = [file for place in (folder, folder.parent) for name in _LISTS if (file := place / name).is_file()]
+    lists = [file for place in (folder, folder.parent) for name in STAMP_LISTS if (file := place / name).is_file()]
     if lists:
         try:
-            lines = [line.strip() for line in lists[0].read_text("utf-8-sig", "replace").splitlines()]
+            with lists[0].open("rb") as file:
+                text = file.read(MAX_RECORD_BYTES).decode("utf-8-sig", "replace")
         except OSError as error:
             raise DriverError(f"cannot read the stamps {str(lists[0])!r}: {error.strerror}") from error
-        texts = [line for line in lines if line and not line.startswith("#")]
+        texts = [line for each in text.splitlines() if (line := each.strip()) and not line.startswith("#")]
         if len(texts) != len(paths):
             raise DriverError(
                 f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(texts)} lines: "
@@ -106,7 +109,7 @@ def _stamp_ns(text: str, image: Path) -> int:
             return int(stamp_ns)
     raise DriverError(
         f"{str(image)!r} has no stamp: expected as its name nanoseconds of 16 to 19 digits, or seconds with a decimal "
-        f"point; or a line for each image with its seconds in {_LISTS[0]}"
+        f"point; or a line for each image with its seconds in {STAMP_LISTS[0]}"
     )
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.bags import Ros1Bag, SqliteBag
-from drivers.logs.image_folder import ImageFolder, image_folders
+from drivers.logs.image_folder import STAMP_LISTS, ImageFolder, image_folders
 from drivers.logs.log import Log, LogFile, listed
 from drivers.logs.mcap_file import McapFile
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, ODOMETRY, parse_image, parse_motion
@@ -95,6 +95,16 @@ def _open_file(path: Path) -> LogFile:
 def logs_in(folder: Path) -> list[Path]:
     """Return the logs in a folder by their names. Raise OSError where it is unreadable."""
     return [file for file in sorted(folder.iterdir()) if is_log_name(file.name) and file.is_file()]
+
+
+def files_in(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder that are read as a log or as images; none where it is no folder."""
+    boards = tuple(f"{camera}_" for camera in CAMERAS)
+    for file in folder.glob("*"):
+        if is_log_name(file.name) or file.name in STAMP_LISTS or file.name.startswith(boards):
+            yield file
+    for images in image_folders(folder):
+        yield from images.iterdir()
 
 
 def parts_in_order(logs: list[Path]) -> list[Path]:

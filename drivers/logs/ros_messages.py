@@ -20,7 +20,8 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 IMU: Final = "sensor_msgs/msg/Imu"
 STAMPED_TYPES: Final = (*IMAGE_TYPES, ODOMETRY, IMU)  # which begin with a header, whose stamp is used
 BASE_FRAME: Final = "base_link"  # Frame of messages whose axes are those of the base (REP 105), as omnid records them.
-_HEADER: Final = struct.Struct("<4xiI")  # with which messages begin: after four bytes seconds, nanoseconds
+CDR: Final = b"\0\1\0\0"  # with which messages in little-endian CDR begin
+HEADER: Final = struct.Struct("<4xiI")  # of messages: after four bytes seconds, nanoseconds
 
 # cv_bridge's names for images without declared colours, in OpenCV's order bgr, and image_encodings.hpp's names of YUV
 _SYNONYMS: Final = {
@@ -58,7 +59,7 @@ def parse_image(kind: str, message: memoryview) -> Frame:
 def compressed_image(stamp_ns: int, image: bytes) -> bytes:
     """Return an image file as a COMPRESSED_IMAGE in CDR, with an empty frame and format."""
     # Both strings have a length of 1, for the zero that ends them, and are filled up to four bytes.
-    head = struct.pack("<4siII4xI4xI", b"\0\1\0\0", *divmod(stamp_ns, 10**9), 1, 1, len(image))
+    head = struct.pack("<4siII4xI4xI", CDR, *divmod(stamp_ns, 10**9), 1, 1, len(image))
     return head + image
 
 
@@ -92,11 +93,11 @@ def _decoded(kind: str, message: memoryview) -> Any:
 
 def header_stamp(message: memoryview) -> int:
     """Return the stamp [ns] of the header with which images, wheels and IMUs begin; 0 where unset, -1 where cut."""
-    start = bytes(message[: _HEADER.size])
-    if len(start) < _HEADER.size:
+    start = bytes(message[: HEADER.size])
+    if len(start) < HEADER.size:
         return -1
     # CDR states its byte order.
-    return _stamp_ns(*struct.unpack(_HEADER.format if start[1] & 1 else ">4xiI", start))
+    return _stamp_ns(*struct.unpack(HEADER.format if start[1] & 1 else ">4xiI", start))
 
 
 typestore = cache(get_typestore)

@@ -66,7 +66,9 @@ def read_places(path: str | Path) -> tuple[PlaceMap, PlaceRig]:
     try:
         if path.exists() and not path.is_file():
             raise ValueError("it is no regular file")
-        zipfile.ZipFile(path).close()  # What numpy raises for another file advises to unpickle it.
+        with zipfile.ZipFile(path) as members:  # What numpy raises for another file advises to unpickle it.
+            if any(one.compress_type != zipfile.ZIP_STORED for one in members.infolist()):
+                raise ValueError("it is compressed, and could unpack to any size")
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in _ARRAYS}
         _check(arrays)

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.log_reader import is_log_name
+from drivers.logs.log_reader import files_in
 from omnid.errors import OmnidError
 from omnid.formats.tum import tum_row
 from omnid.messages import OdometryUpdate
@@ -23,10 +23,9 @@ Named: TypeAlias = Sequence[tuple[str, Path]]
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written, and none is another one or an input (name, path).
 
-    Inputs are files, or folders of which the logs are read. Leaves no file behind. Raises OmnidError.
+    Inputs are files, or folders of logs or images. Leaves no file behind. Raises OmnidError.
     """
-    used = {_identity(path): what for what, path in inputs}
-    used |= {_identity(log): what for what, path in inputs for log in path.glob("*") if is_log_name(log.name)}
+    used = {_identity(file): what for what, path in inputs for file in (path, *files_in(path))}
     for option, path in outputs:
         wrong = ""
         if path.is_dir():

@@ -110,6 +110,24 @@ def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, message: str) ->
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "polynomial = [",
+            f"polynomial = [{'-1.0, ' * 10**5}",
+            "expected 1 to 32 coefficients, found 100005",
+        ),
+        ('"lower a4"', '"lower a999999999"', "covariance.parameters: expected names of the cameras' parameters"),
+    ],
+)
+def test_polynomials_are_bounded(ocam_rig: Rig, old: str, new: str, message: str) -> None:
+    text = rig_toml(replace(ocam_rig, covariance=RigCovariance(("lower a4",), np.ones(1), np.eye(1))))
+    assert parse_rig(text).covariance is not None
+    with pytest.raises(CalibError, match=message):
+        parse_rig(text.replace(old, new, 1))
+
+
 def test_the_image_of_a_mask_has_the_size_of_the_images(omni_rig: Rig) -> None:
     mask = Mask((1.0, 1.0), image=np.zeros((4, 5), np.uint8))
     with pytest.raises(CalibError, match=r"lower\.mask\.image: expected \(768, 770\).* found \(5, 4\)"):

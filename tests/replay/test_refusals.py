@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import PAIRS
-from tests.drivers.logs.mcap_logs import Entry, text, write_log
+from tests.drivers.logs.mcap_logs import Entry, pairs, text, write_folders, write_log
 from tests.replay.command import Command, rows
 from tests.replay.edited import images, save
 
@@ -106,6 +106,11 @@ def test_no_command_overwrites_its_inputs(omnid: Command, tmp_path: Path, scene:
         error = omnid.refused("replay", bag, "--rig", rig, "--config", settings, "--quiet", "--record", path)
         assert f"the {what} that is read" in error
     assert "the log that is read" in omnid.refused("report", bag, "--output", bag / "bag_0.mcap")
+    lists = write_folders(tmp_path / "images", pairs(1)) / "times.txt"
+    lists.touch()
+    for path in (lists, *lists.parent.glob("*/*.jpg")):
+        error = omnid.refused("replay", lists.parent, "--rig", rig, "--quiet", "--tum", path)
+        assert "the log that is read" in error
     assert {path: path.read_bytes() for path in before} == before
 
 

@@ -345,6 +345,25 @@ def test_a_compressed_message_unpacks_to_a_bounded_size() -> None:
             unpack_message(memoryview(damaged))
 
 
+@pytest.mark.parametrize("compression", ["LZ4", pytest.param("BZ2", marks=pytest.mark.slow)])
+def test_a_chunk_of_a_bag_unpacks_to_a_bounded_size(tmp_path: Path, compression: str) -> None:
+    huge = Entry(LOWER, COMPRESSED, compressed(START_NS, bytes(270 * 2**20)), START_NS)
+    path = write_bag(tmp_path / "log.bag", [*pairs(2), huge], compression, chunk_bytes=100)
+    assert path.stat().st_size < 4 * 2**20
+    found, reader = read(path)
+    assert found == expected(2) and is_one_fault(reader.warnings)
+
+
+def test_chunks_of_a_bag_that_share_an_index_are_refused(tmp_path: Path) -> None:
+    """They would list any number of messages."""
+    path = write_bag(tmp_path / "log.bag", pairs(PAIRS))
+    data = path.read_bytes()
+    info, count = data[data.rindex(b"op=\x06") - 8 :], data.index(b"chunk_count=") + len(b"chunk_count=")
+    path.write_bytes(data[:count] + struct.pack("<I", 1001) + data[count + 4 :] + info * 1000)
+    with pytest.raises(DriverError, match="index has more bytes than the file"):
+        LogReader(path)
+
+
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).bytes(200_000)
     entries = [entry._replace(data=compressed(entry.log_time_ns, jpeg(1) + noise)) for entry in pairs(100)]

@@ -72,7 +72,8 @@ def test_files_that_are_no_map_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "map.ply").write_bytes(b"ply\n")
     (tmp_path / "old.omap").write_bytes(b"SQLite format 3\0" + bytes(100))
-    for name in ("pipe", "map.ply", "old.omap"):
+    np.savez_compressed(tmp_path / "packed.npz", views=np.zeros(10**7))
+    for name in ("pipe", "map.ply", "old.omap", "packed.npz"):
         with pytest.raises(OmnidError, match=r"expected a map of places .*`omnid map build` makes one"):
             read_places(tmp_path / name)
     for name in ("missing.omap", "a\0b"):
