@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder, at_pixels
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.tracking import normalised_patches
+from omnid.core.odometry.tracking import correlations, padded
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -59,12 +59,11 @@ def contradicted(
     for at in (pixels, seen):
         chosen &= np.abs(at[:, 1] - middle) <= middle - HALF_PX
     # 2. The correlations of both hypotheses there; they are one where the point has not moved in the image.
-    here, there = pixels[chosen], seen[chosen]
-    now, _ = normalised_patches(lower, here, 2 * HALF_PX + 1)
-    of_world, of_rig = (
-        (now * normalised_patches(earlier.lower, at, 2 * HALF_PX + 1)[0]).sum(axis=1) for at in (there, here)
-    )
+    here, there, images = padded(lower, pixels[chosen]), padded(lower, seen[chosen]), (lower.image, earlier.lower.image)
+    of_world = correlations(images, here, there, 2 * HALF_PX + 1)
     has_moved = np.hypot(lower.wrap(there[:, 0] - here[:, 0]), there[:, 1] - here[:, 1]) > HALF_PX
+    is_wrong, asked = of_world < LEAST, np.flatnonzero(has_moved & (of_world >= LEAST))
+    is_wrong[asked] = correlations(images, here[asked], here[asked], 2 * HALF_PX + 1) > of_world[asked]
     wrong = np.zeros(len(points), bool)
-    wrong[chosen] = (of_world < LEAST) | (has_moved & (of_rig > of_world))
+    wrong[chosen] = is_wrong
     return wrong

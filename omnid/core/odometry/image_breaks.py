@@ -32,7 +32,7 @@ from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.line_times import CAMERAS, LAG_S, LEAST_PX, MEMORY_S, SETS, LineTimes, RawImage, camera_names
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
-from omnid.core.odometry.plane_patches import WINDOW_PX, align, plane_maps, plane_templates
+from omnid.core.odometry.plane_patches import WINDOW_PX, align, plane_templates
 from omnid.core.odometry.pose_estimation import CORRELATED, DAMPING, GAUSS_NEWTON_STEPS, OUTLIER_SQUARED, VIEW, cost
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import motion_jacobian, view, view_jacobian
@@ -240,10 +240,10 @@ def _flow(
         # The upper camera is like a lower one whose frame is higher, in which slopes are those over its own rows.
         up, bent = np.eye(4), slopes[rows] / (1.0 + camera * slopes[rows, 1:])
         up[2, 3] = -camera * baseline_m
-        T_now_last = np.tile(up @ se3.inverse(now.T_odom_rect) @ last.T_odom_rect @ se3.inverse(up), (len(rows), 1, 1))
-        surfaces = se3.apply(up, seen[0][rows]), bent
-        maps = plane_maps(surfaces, T_now_last, there[rows], model)
-        aligned = align(plane_templates(last.pair[camera], start[rows], maps), now.pair[camera], there[rows])
+        T_now_last = up @ se3.inverse(now.T_odom_rect) @ last.T_odom_rect @ se3.inverse(up)
+        planes = (se3.apply(up, seen[0][rows]), bent), T_now_last, there[rows]
+        templates = plane_templates(last.pair[camera], start[rows], *planes, model)
+        aligned = align(templates, now.pair[camera], there[rows])
         is_aligned = rows[aligned.found]
         there[is_aligned], found[is_aligned] = aligned.pixels[aligned.found], True
         rows = np.flatnonzero(found)

@@ -27,7 +27,6 @@ from omnid.core.odometry.plane_patches import (
     AlignedPatches,
     align,
     moved_slopes,
-    plane_maps,
     plane_templates,
 )
 from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED, POSE
@@ -292,13 +291,14 @@ class LocalMap:
         predicted (M, 2): their pixels by that pose. A patch is found where it has texture and moved by less than
         reach_px from there. upper: it is the upper panorama.
         """
-        table, T_curr_ref = self.table, self.from_anchors(T_odom_rect, landmarks)
+        table, T_rect_odom = self.table, se3.inverse(T_odom_rect)
         templates = np.empty((len(landmarks), WINDOW_PX + 2, WINDOW_PX + 2), np.float32)
-        surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
-        maps = plane_maps(surfaces, T_curr_ref, predicted, self._model, upper=upper)
         for seq, keyframe in self.keyframes.items():
             own = np.flatnonzero(table.anchor[landmarks] == seq)
-            templates[own] = plane_templates(keyframe.lower, table.anchor_pixels[landmarks[own]], maps[own])
+            rows, T_curr_ref = landmarks[own], T_rect_odom @ keyframe.T_odom_rect
+            pixels, surfaces = table.anchor_pixels[rows], (table.anchor_points[rows], table.slopes[rows])
+            seen = T_curr_ref, predicted[own], self._model
+            templates[own] = plane_templates(keyframe.lower, pixels, surfaces, *seen, upper=upper)
         return align(templates, panorama, predicted, reach_px)
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:

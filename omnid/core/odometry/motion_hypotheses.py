@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import SAME_M, PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.patch_kernels import MIN_CONTRAST
-from omnid.core.odometry.tracking import PEAKS, normalised_patches
+from omnid.core.odometry.tracking import PEAKS, correlations, padded
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
@@ -133,7 +132,7 @@ def displacements(
     At most PEAKS, best first; the pose itself may be among them, as (0, 0). None if reach_m, the largest one that is
     searched, is less than a step of the grid.
     """
-    # 1. The grid, and the patches in the last panorama.
+    # 1. The grid, and the landmarks in the last panorama.
     table = local_map.table
     rows = np.flatnonzero(np.isfinite(table.pixels[:, 0]))
     rows = rows[:: max(1, -(-len(rows) // LANDMARKS))]
@@ -146,23 +145,21 @@ def displacements(
         return []
     steps = math.ceil(reach_m / step_m)
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
-    at, blurred = np.rint(table.pixels[rows]), _blurred(local_map.last)
-    patches, contrast = normalised_patches(local_map.last, at, SAMPLES, SAMPLE_PX, blurred)
-    textured = contrast > MIN_CONTRAST
-    if not textured.any():
-        return []
-    # 2. Their mean correlation with the current one.
-    blurred, scores = _blurred(current), np.empty((len(offsets), len(offsets)))
+    # 2. Their mean correlation with the current one; those without texture have none.
+    images = _halved(local_map.last), _halved(current)
+    at = np.tile(padded(local_map.last, table.pixels[rows]) / SAMPLE_PX, (len(offsets), 1))
+    scores = np.empty((len(offsets), len(offsets)))
     for a, x in enumerate(offsets):
         moved = np.concatenate([points - (x, y, 0.0) for y in offsets])
-        pixels = view(moved, model.cylinder, model.baseline_m)[:, :2]
-        seen, _ = normalised_patches(current, np.rint(pixels), SAMPLES, SAMPLE_PX, blurred)
-        each = np.einsum("gns,ns->gn", seen.reshape(len(offsets), *patches.shape), patches)
-        scores[a] = each[:, textured].mean(axis=1)
+        there = padded(current, view(moved, model.cylinder, model.baseline_m)) / SAMPLE_PX
+        each = correlations(images, at, there, SAMPLES)
+        scores[a] = each.reshape(len(offsets), -1).mean(axis=1)
     # 3. Its peaks.
     is_peak = (scores == cv2.dilate(scores, np.ones((3, 3)))) & (scores > PEAK_SHARE * scores[steps, steps])
     return [offsets[at] for at in sorted(np.argwhere(is_peak), key=lambda at: -scores[tuple(at)])[:PEAKS]]
 
 
-def _blurred(panorama: PaddedPanorama) -> NDArray[np.float32]:
-    return np.asarray(cv2.GaussianBlur(panorama.image.astype(np.float32), (0, 0), SAMPLE_PX), np.float32)
+def _halved(panorama: PaddedPanorama) -> NDArray[np.uint8]:
+    """Return an image with a pixel for each sample."""
+    blurred = np.asarray(cv2.GaussianBlur(panorama.image, (0, 0), SAMPLE_PX), np.uint8)
+    return np.ascontiguousarray(blurred[::SAMPLE_PX, ::SAMPLE_PX])

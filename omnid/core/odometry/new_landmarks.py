@@ -22,7 +22,7 @@ from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.local_map import NewLandmarks
 from omnid.core.odometry.plane_patches import align_rows, disparity_slopes, fitted_slopes, view_noise
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import KltSettings, normalised_patches, track
+from omnid.core.odometry.tracking import KltSettings, correlations, padded, track
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
@@ -95,14 +95,15 @@ def _has_wrong_period(pair: Pair, pixels: Array, rows: Array, known: Array, most
         first, end, own_px = np.zeros(len(pixels)), np.full(len(pixels), most_px + 1.0), REACH_PX
         wrong = compared = np.ones(len(pixels), bool)
     # 2. The best correlations of the patch at its own and at the others.
-    lower, _ = normalised_patches(pair[0], np.rint(pixels), SIDE_PX)
+    places, images = padded(pair[0], pixels), (pair[0].image, pair[1].image)
     for n in np.flatnonzero(compared):
         at_own = np.rint(own[n]) + np.arange(-own_px, own_px + 1)
         elsewhere = np.setdiff1d(np.arange(first[n], end[n]), at_own)
         scores = []
         for disparities in (at_own, elsewhere):
-            there = np.rint(pixels[n]) + np.outer(disparities, [0.0, 1.0])
-            upper, _ = normalised_patches(pair[1], there[there[:, 1] <= last], SIDE_PX)
-            scores.append((lower[n] * upper).sum(axis=1).max(initial=-1.0))
+            here = np.rint(places[n]) + np.zeros((len(disparities), 2))
+            there = here + np.outer(disparities, [0.0, 1.0])
+            is_inside = there[:, 1] <= last
+            scores.append(correlations(images, here[is_inside], there[is_inside], SIDE_PX).max(initial=-1.0))
         wrong[n] = len(elsewhere) > 0 and scores[1] > scores[0] - LEAST_LEAD
     return np.asarray(wrong & (len(known) > 0 or wrong.mean() > 1 - LEAST_UNIQUE_SHARE))

@@ -1,4 +1,4 @@
-"""Compiled part of the patches of planes, see plane_patches.py for the equations and the arguments."""
+"""Compiled part of the patches of planes, see plane_patches.py for the equations and the arguments; correlation."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
+from omnid.core.stereo.view_kernels import moved, turned
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+Integers = NDArray[np.int32]
 
 # Enough: 98 % of the patches of test_plane_patches.py end before; a last step is below the hundredths that noise
 # leaves.
@@ -28,28 +31,44 @@ NOISE_CORRELATION = 3.0
 # Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix, and
 # the least share of that matrix that counts as texture.
 GRADIENT_NOISE, MIN_TRUE_GRADIENT = 0.12, 0.2
+MAX_SLOPE = 0.7  # Largest slope of a disparity: steeper planes are seen too obliquely for a patch.
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
 
 
-@compiled("(u1[:, ::1], f8[:, ::1], f8[:, :, :, ::1], i8[::1], f4[:, :, ::1])", writes=("templates",))
-def sample(image: Image, centres: Array, powers: Array, reaches: Indices, templates: Floats) -> None:
+@compiled(
+    "(u1[:, ::1], f8[:, ::1], f8[:, :], f8[:, :], f8[:, :], f8[:, :], UniTuple(f8, 3), f4[:, :, ::1])",
+    writes=("templates",),
+)
+def sample(
+    image: Image,
+    centres: Array,
+    points: Array,
+    slopes: Array,
+    T_curr_ref: Array,
+    predicted: Array,
+    lengths: Vector,
+    templates: Floats,
+) -> None:
     """Write the templates (N, T, T) of patches of an image.
 
-    centres (N, 2) [px] in the image; powers (N, 2, 3, 3): polynomials of row and column from a template's middle, which
-    say how many columns and rows from the centre its pixels are; reaches (N,) [px]: none is farther; -1: unknown.
+    centres (N, 2) [px] in the image; the others: see `write_map`.
     """
     side, half = templates.shape[1], templates.shape[1] // 2
-    most = 2 * reaches.max() + 5 if len(reaches) else 0
-    cell, part = np.empty((most, most), np.float32), np.empty(4, np.float32)
+    cell, part = np.empty((0, 0), np.float32), np.empty(4, np.float32)
+    nodes, powers = np.empty((2, 3, 3)), np.empty((2, 3, 3))
+    columns, rows = powers[0], powers[1]
     for n in range(len(templates)):
+        write_map(points[n], slopes[n], T_curr_ref, predicted[n], lengths, half, nodes, powers)
+        reach_px = max(reach_of(columns, half), reach_of(rows, half))
         # A place that is unknown or outside has no template.
-        is_inside = 0 <= centres[n, 0] < image.shape[1] and 0 <= centres[n, 1] < image.shape[0]
-        if reaches[n] < 0 or not is_inside:
+        if not (0 <= centres[n, 0] < image.shape[1] and 0 <= centres[n, 1] < image.shape[0]) or math.isnan(reach_px):
             templates[n] = 0.0
             continue
         # 1. The pixels that the template and the cubic kernel reach.
-        reach, width = reaches[n] + 1, 2 * reaches[n] + 5
-        columns, rows = powers[n, 0], powers[n, 1]
+        reach = math.ceil(reach_px) + 1
+        width = 2 * reach + 3
+        if len(cell) < width:
+            cell = np.empty((width, width), np.float32)
         left, top = math.floor(centres[n, 0]) - reach, math.floor(centres[n, 1]) - reach
         copy_cell(image, left, top, width, width, cell)
         # 2. The places of the template's pixels in between.
@@ -73,6 +92,94 @@ def sample(image: Image, centres: Array, powers: Array, reaches: Indices, templa
                     part[m] = a * above[k + m] + b * here[k + m] + c * below[k + m] + d * last[k + m]
                 a, b, c, d = keys(x - np.float32(column))
                 templates[n, i, j] = (a * part[0] + b * part[1]) + (c * part[2] + d * part[3])
+
+
+@inner
+def normal_of(p: Array, slopes: Array, baseline_m: float) -> Vector:
+    """Return n [1/m] of the plane n . p = 1 through a point with slopes of the disparity.
+
+    The disparity f t / r is f t n . u for the ray u with r = 1, azimuth and the height of u fall by 1 / f from pixel
+    to pixel: so the slopes are -t times the components of n along azimuth and axis.
+    """
+    r = math.hypot(p[0], p[1])
+    x, y, sideways, up = p[0] / r, p[1] / r, -slopes[0] / baseline_m, -slopes[1] / baseline_m
+    ahead = (1 - up * p[2]) / r
+    return ahead * x - sideways * y, ahead * y + sideways * x, up
+
+
+@compiled("(f8[:, :], f8[:, :], f8[:, :, :], f8, f8[:, ::1])", writes=("result",))
+def write_moved_slopes(points: Array, slopes: Array, T_curr_ref: Array, baseline_m: float, result: Array) -> None:
+    """Write the slopes (N, 2) of planes in other frames; zero where the plane is seen nearly edge on."""
+    for k in range(len(points)):
+        T = T_curr_ref[k]
+        n, (x, y, _) = turned(T, normal_of(points[k], slopes[k], baseline_m)), moved(T, points[k])
+        # The plane n' . p' = 1 + n' . t has the normal n' / (1 + n' . t).
+        scale = 1 + n[0] * T[0, 3] + n[1] * T[1, 3] + n[2] * T[2, 3]
+        along, up = (x * n[1] - y * n[0]) / (math.hypot(x, y) * scale), n[2] / scale
+        is_seen = max(abs(along), abs(up)) * baseline_m < MAX_SLOPE
+        result[k, 0], result[k, 1] = (-baseline_m * along, -baseline_m * up) if is_seen else (0.0, 0.0)
+
+
+@inner
+def write_map(
+    p: Array, slopes: Array, T: Array, predicted: Array, lengths: Vector, half: int, nodes: Array, powers: Array
+) -> None:
+    """Write powers (2, 3, 3) of rows and columns from a template's middle, for those from the patch's centre.
+
+    p (3,), slopes (2,): the plane in the frame of the patch. T: from there to the current one, which shows p at
+    predicted (2,). lengths: focal length [px], baseline, height of the current viewpoint above the lower one [m].
+    half: of a template [px]. nodes: room for (2, 3, 3).
+    """
+    # 1. The plane n' . (p' - o') = scale, and the point, from the current viewpoint o'.
+    focal_px, baseline_m, height_m = lengths
+    n, (x, y, z) = turned(T, normal_of(p, slopes, baseline_m)), moved(T, p)
+    t = T[0, 3], T[1, 3], T[2, 3] - height_m
+    scale = 1 + n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
+    r, azimuth, rise = math.hypot(p[0], p[1]), math.atan2(y, x), (z - height_m) / math.hypot(x, y)
+    right, below = np.rint(predicted[0]) - predicted[0], np.rint(predicted[1]) - predicted[1]
+    is_bent = scale > 0
+    for j in range(3):
+        # 2. The rays of corners, middles of the sides and middle, of length 1 across; azimuth falls with the column.
+        turn = azimuth - (half * (j - 1) + right) / focal_px
+        u, v = math.cos(turn), math.sin(turn)
+        for i in range(3):
+            w = rise - (half * (i - 1) + below) / focal_px
+            # 3. Their points on the plane, in the frame of the image, with the azimuth of the patch as x axis.
+            along = u * n[0] + v * n[1] + w * n[2]
+            reach = scale / along
+            a, b, c = u * reach - t[0], v * reach - t[1], w * reach - t[2]
+            x, y = T[0, 0] * a + T[1, 0] * b + T[2, 0] * c, T[0, 1] * a + T[1, 1] * b + T[2, 1] * c
+            high = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+            ahead, left = (x * p[0] + y * p[1]) / r, (y * p[0] - x * p[1]) / r
+            nodes[0, i, j] = -focal_px * math.atan2(left, ahead)
+            nodes[1, i, j] = focal_px * (p[2] / r - high / math.hypot(ahead, left))
+            is_bent &= along > 0 and ahead > 0 and max(abs(nodes[0, i, j]), abs(nodes[1, i, j])) < 4 * half + 2
+    for i in range(3):
+        for j in range(3):
+            if not is_bent:
+                nodes[0, i, j], nodes[1, i, j] = half * (j - 1) + right, half * (i - 1) + below
+    # 4. Between them quadratic polynomials: of the columns, and of the rows.
+    for axis in range(2):
+        for i in range(3):
+            nodes[axis, i] = quadratic(nodes[axis, i, 0], nodes[axis, i, 1], nodes[axis, i, 2], half)
+        for j in range(3):
+            powers[axis, :, j] = quadratic(nodes[axis, 0, j], nodes[axis, 1, j], nodes[axis, 2, j], half)
+
+
+@inner
+def quadratic(a: float, b: float, c: float, half: int) -> Vector:
+    """Return the polynomial that is a, b and c at -half, 0 and half."""
+    return b, (c - a) / (2 * half), ((a + c) / 2 - b) / half**2
+
+
+@inner
+def reach_of(powers: Array, half: int) -> float:
+    """Return the most that a polynomial (3, 3) is within half of the middle."""
+    most = 0.0
+    for i in range(3):
+        for j in range(3):
+            most += abs(powers[i, j]) * float(half) ** (i + j)
+    return most
 
 
 @inner
@@ -265,3 +372,42 @@ def write_covariance(inverse: Array, variance: float, pixels: int, covariance: A
     for a in range(2):
         for b in range(2):
             covariance[a, b] = NOISE_CORRELATION * variance / texture * inverse[a, b]
+
+
+@compiled("(u1[:, ::1], u1[:, ::1], f8[:, ::1], f8[:, ::1], i8, f8[::1])", writes=("found",))
+def correlate(a: Image, b: Image, at_a: Array, at_b: Array, side: int, found: Array) -> None:
+    """Write the correlations (N,) of windows of side^2 greys about places (N, 2) of two images; 0: no texture."""
+    pixels, least = side**2, (side**2 * MIN_CONTRAST) ** 2
+    cell, size = np.zeros((side + 1) ** 2 + 1, np.int32), side * (side + 1)
+    one, other = np.empty(size, np.int32), np.empty(size, np.int32)
+    for n in range(len(found)):
+        write_greys(a, at_a[n], side, cell, one)
+        write_greys(b, at_b[n], side, cell, other)
+        x, y, xx, yy, xy = 0, 0, 0, 0, 0
+        for k in range(len(one)):
+            x, y = x + one[k], y + other[k]
+            xx, yy, xy = xx + one[k] * one[k], yy + other[k] * other[k], xy + one[k] * other[k]
+        spread, spread_of_other = float(pixels * xx - x * x), float(pixels * yy - y * y)
+        is_textured = min(spread, spread_of_other) > least
+        found[n] = float(pixels * xy - x * y) / math.sqrt(spread * spread_of_other) if is_textured else 0.0
+
+
+@inner
+def write_greys(image: Image, at: Array, side: int, cell: Integers, greys: Integers) -> None:
+    """Write the greys (side, side + 1) about a place, the last column zeros, by bilinear interpolation to 1/32 px.
+
+    cell: room for a row and a column more. Windows lie within the columns; the first and last rows are repeated. All
+    are integers and rows follow each other, so that several are computed at once.
+    """
+    left, top, width = math.floor(at[0]) - side // 2, math.floor(at[1]) - side // 2, side + 1
+    u, v = np.int32(32 * (at[0] - math.floor(at[0])) + 0.5), np.int32(32 * (at[1] - math.floor(at[1])) + 0.5)
+    left = min(max(left, 0), image.shape[1] - width)
+    for i in range(width):
+        line, to = image[within(top + i, len(image)), left:], cell[i * width :]
+        for j in range(width):
+            to[j] = line[j]
+    p, q, r, s = (32 - u) * (32 - v), u * (32 - v), (32 - u) * v, u * v
+    for k in range(side * width):
+        greys[k] = (p * cell[k] + q * cell[k + 1] + r * cell[k + width] + s * cell[k + width + 1] + 512) >> 10
+    for i in range(side):
+        greys[i * width + side] = 0

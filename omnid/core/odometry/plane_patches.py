@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import at_pixels
 from omnid.core.odometry import patch_kernels
+from omnid.core.odometry.patch_kernels import MAX_SLOPE
 from omnid.core.odometry.tracking import padded
 from omnid.core.stereo.triangulation import triangulate
 from omnid.core.types.panorama import PaddedPanorama
@@ -37,7 +38,6 @@ SLOPE_PRIOR = 50.0
 # Side of the window in which slopes are fitted, by trial on development logs: in a smaller one they are noisier, a
 # larger one leaves the plane.
 SLOPE_WINDOW_PX, SLOPE_ROUNDS = 21, 2
-MAX_SLOPE = 0.7  # Largest slope of a disparity: steeper planes are seen too obliquely for a patch.
 # Standard deviation [px/px] of the slopes by dense stereo, which are a third too flat, because its windows are upright.
 SLOPE_SIGMA = 0.1
 REACH_PX = 1  # largest distance of an aligned patch from its prediction, if pose and depth are known well
@@ -53,19 +53,9 @@ class AlignedPatches:
     found: Flags  # (N,) textured, and near the prediction
 
 
-def plane_templates(image: PaddedPanorama, pixels: Array, maps: Array, window_px: int = WINDOW_PX) -> Floats:
-    """Return templates (N, T, T) of patches at pixels (N, 2) of an image, less grey 128, by their plane_maps.
-
-    They hold the window and the border that the gradient's 3x3 operator needs.
-    """
-    templates, half = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32), window_px // 2 + 1
-    terms = np.abs(maps) * float(half) ** np.add.outer(np.arange(3), np.arange(3))
-    reaches = np.nan_to_num(np.ceil(terms.sum(axis=(2, 3)).max(axis=1)), nan=-1.0).astype(np.intp)
-    patch_kernels.sample(image.image, padded(image, pixels), maps, reaches, templates)
-    return templates
-
-
-def plane_maps(
+def plane_templates(
+    image: PaddedPanorama,
+    pixels: Array,
     surfaces: tuple[Array, Array],
     T_curr_ref: Array,
     predicted: Array,
@@ -73,60 +63,20 @@ def plane_maps(
     *,
     upper: bool = False,
     window_px: int = WINDOW_PX,
-) -> Array:
-    """Return where an image shows the pixels of N templates, as the current view shows its planes: (N, 2, 3, 3).
+) -> Floats:
+    """Return templates (N, T, T) of patches at pixels (N, 2) of an image as the current view shows them, less grey 128.
 
-    Polynomials of row and column from a template's middle give columns and rows from the patch's centre in the image.
+    They hold the window and the border that the gradient's 3x3 operator needs.
 
     surfaces: points (N, 3) [m] at the patches' centres and slopes (N, 2) of the disparity there, both in the rectified
-    frame of the image; T_curr_ref (N, 4, 4) from it. upper: the current panorama is the upper one. The templates'
-    pixels are whole pixels of the current panorama, which shows the centres at predicted (N, 2). Where a plane is seen
-    edge on, or explains a part alone, the patch is not bent.
+    frame of the image; T_curr_ref (4, 4) from it. upper: the current panorama is the upper one. The templates' pixels
+    are whole pixels of the current panorama, which shows the centres at predicted (N, 2). Where a plane is seen edge
+    on, or explains a part alone, the patch is not bent.
     """
-    # 1. The plane n' . (p' - o') = scale, and the points, from the current viewpoint o'.
-    (points, _), focal_px = surfaces, model.cylinder.focal_px
-    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3] - (0.0, 0.0, model.baseline_m if upper else 0.0)
-    n = np.einsum("nij,nj->ni", R, _normals(surfaces, model.baseline_m))
-    seen = np.einsum("nij,nj->ni", R, points) + t
-    scale, r, seen_r = 1 + (n * t).sum(axis=1), np.hypot(*points[:, :2].T), np.hypot(*seen[:, :2].T)
-    # 2. The rays of corners, middles of the sides and middle, of horizontal length 1; azimuth falls with the column.
-    half, shift = window_px // 2 + 1, np.rint(predicted) - predicted
-    at = half * np.arange(-1.0, 2.0)
-    offsets = at + shift[:, :, None]
-    azimuth = np.arctan2(seen[:, 1], seen[:, 0])[:, None] - offsets[:, 0] / focal_px
-    rays = np.empty((len(points), 3, 3, 3))
-    rays[..., 0], rays[..., 1] = np.cos(azimuth)[:, None], np.sin(azimuth)[:, None]
-    rays[..., 2] = ((seen[:, 2] / seen_r)[:, None] - offsets[:, 1] / focal_px)[:, :, None]
-    # 3. Their points on the plane, in the frame of the image, with the azimuth of the patch as x axis.
-    along = np.einsum("nijk,nk->nij", rays, n)
-    rays *= (scale[:, None, None] / along)[..., None]
-    rays -= t[:, None, None]
-    x, y = (points[:, :2] / r[:, None]).T[:, :, None]
-    axes = R[:, :, 0] * x + R[:, :, 1] * y, R[:, :, 1] * x - R[:, :, 0] * y, R[:, :, 2]
-    ahead, left, high = (np.einsum("nijk,nk->nij", rays, axis) for axis in axes)
-    nodes = np.empty((len(points), 2, 3, 3))
-    nodes[:, 0] = -focal_px * np.arctan2(left, ahead)
-    nodes[:, 1] = focal_px * ((points[:, 2] / r)[:, None, None] - high / np.hypot(ahead, left))
-    is_bent = (along > 0) & (ahead > 0) & (np.abs(nodes) < 4 * half + 2).all(axis=1)
-    is_flat = ~(is_bent.all(axis=(1, 2)) & (scale > 0))
-    nodes[is_flat, 0], nodes[is_flat, 1] = offsets[is_flat, 0][:, None], offsets[is_flat, 1][:, :, None]
-    # 4. Between them quadratic polynomials.
-    to_powers = np.linalg.inv(np.vander(at, increasing=True))
-    return np.asarray(nodes.reshape(-1, 9) @ np.kron(to_powers, to_powers).T).reshape(nodes.shape)
-
-
-def _normals(surfaces: tuple[Array, Array], baseline_m: float) -> Array:
-    """Return n (N, 3) [1/m] of the planes n . p = 1 through points (N, 3) with slopes (N, 2) of the disparity.
-
-    The disparity f t / r is f t n . u for the ray u with r = 1, azimuth and the height of u fall by 1 / f from pixel
-    to pixel: so the slopes are -t times the components of n along azimuth and axis.
-    """
-    points, slopes = surfaces
-    r = np.hypot(points[:, 0], points[:, 1])
-    x, y = points[:, 0] / r, points[:, 1] / r
-    sideways, up = (-slopes / baseline_m).T
-    ahead = (1 - up * points[:, 2]) / r
-    return np.column_stack([ahead * x - sideways * y, ahead * y + sideways * x, up])
+    templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
+    lengths = model.cylinder.focal_px, model.baseline_m, model.baseline_m if upper else 0.0
+    patch_kernels.sample(image.image, padded(image, pixels), *surfaces, T_curr_ref, predicted, lengths, templates)
+    return templates
 
 
 def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: StereoModel) -> Array:
@@ -134,14 +84,9 @@ def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: Stereo
 
     surfaces: points (N, 3) and slopes (N, 2). Zero where the plane is seen nearly edge on.
     """
-    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3]
-    n = (R @ _normals(surfaces, model.baseline_m)[:, :, None])[:, :, 0]
-    seen = (R @ surfaces[0][:, :, None])[:, :, 0] + t
-    # The plane n' . p' = 1 + n' . t has the normal n' / (1 + n' . t).
-    n /= 1 + (n * t).sum(axis=1, keepdims=True)
-    along = (seen[:, 0] * n[:, 1] - seen[:, 1] * n[:, 0]) / np.hypot(seen[:, 0], seen[:, 1])
-    moved = -model.baseline_m * np.column_stack([along, n[:, 2]])
-    return np.where((np.abs(moved) < MAX_SLOPE).all(axis=1, keepdims=True), moved, 0.0)
+    moved = np.empty((len(T_curr_ref), 2))
+    patch_kernels.write_moved_slopes(*surfaces, T_curr_ref, model.baseline_m, moved)
+    return moved
 
 
 def disparity_slopes(disparity: Floats, points: Array, centre: Array) -> Array:
@@ -193,9 +138,8 @@ def _in_upper(
 ) -> Floats:
     """Return templates of the lower panorama's patches at pixels (N, 2) as the upper one shows them at predicted."""
     points = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
-    surfaces, identity = (points, slopes), np.tile(np.eye(4), (len(pixels), 1, 1))
-    maps = plane_maps(surfaces, identity, predicted, model, upper=True, window_px=window_px)
-    return plane_templates(pair[0], pixels, maps, window_px)
+    surfaces = points, slopes
+    return plane_templates(pair[0], pixels, surfaces, np.eye(4), predicted, model, upper=True, window_px=window_px)
 
 
 def align(

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.stereo.triangulation import motion_jacobian, triangulate, view, view_jacobian
+from omnid.core.stereo import view_kernels
+from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -136,24 +137,22 @@ def gauss_newton(
     S[is_lower_only, 2, 2] = 1.0
     information = np.asarray(np.linalg.inv(S), float)
     information[is_lower_only, 2, 2] = 0.0
-    views = np.where(np.isnan(views), 0.0, views)
     # 2. Steps. If one is short, the last equations hold after it as well.
-    error = np.zeros(size - POSE)
+    cylinder, focal_px = model.cylinder, model.cylinder.focal_px
+    column0 = cylinder.left_rad * focal_px - 0.5
+    camera = focal_px, column0, cylinder.row0, float(cylinder.period_px), model.baseline_m
+    views, error, e = np.nan_to_num(views), np.zeros(size - POSE), np.empty(views.shape)
+    J = np.concatenate([np.zeros((len(views), VIEW, POSE)), -by_error], axis=2)
+    informed, squared = information @ J, np.empty(len(views))
     for number in range(GAUSS_NEWTON_STEPS + 1):
         # The errors e = v - view(T p) + D s, and their derivatives -J by [t; r] on the left of T and by s.
-        points = se3.apply(T, landmarks)
-        e = views - view(points, model.cylinder, model.baseline_m) + by_error @ error
-        e[:, 0] = model.cylinder.wrap(e[:, 0])
-        J = np.concatenate([motion_jacobian(points, model.cylinder, model.baseline_m), -by_error], axis=2)
-        informed = np.einsum("nij,nj->ni", information, e)
-        squared = (e * informed).sum(axis=1)
+        view_kernels.compare(T, landmarks, views + by_error @ error, information, camera, e, J, informed, squared)
         weight = 1 / (1 + squared / KERNEL_WIDTH**2)
         is_right = squared < OUTLIER_SQUARED
         if number >= OUTLIER_STEPS and is_right.sum() >= POSE:  # fewer leave the equations singular
             weight = np.where(is_right, weight, 0.0)
-        weighted = J * weight[:, None, None]
-        H = prior + np.tensordot(weighted, information @ J, axes=((0, 1), (0, 1)))
-        g = np.tensordot(weighted, informed, axes=((0, 1), (0, 1))) - prior[:, POSE:] @ error
+        weighted = (informed * weight[:, None, None]).reshape(-1, size).T
+        H, g = prior + weighted @ J.reshape(-1, size), weighted @ e.ravel() - prior[:, POSE:] @ error
         if number == GAUSS_NEWTON_STEPS:
             break
         step = np.linalg.inv(H) @ g
@@ -167,5 +166,5 @@ def gauss_newton(
     share = max((float(squared[is_right].sum()) + POSE) / max(numbers, POSE), 1.0 if len(of_error) else 0.0)
     inverse = np.asarray(np.linalg.inv(H + (share - 1) * prior), float)
     # 4. A motion of a landmark changes its error by J, and the solution by H^-1 J^T S^-1 J.
-    by_motion = np.linalg.inv(H)[:POSE] @ np.swapaxes(weighted, 1, 2) @ information @ J[:, :, :POSE]
-    return GaussNewtonResult(T, share * inverse[:POSE, :POSE], squared, by_motion)
+    of_views = (np.linalg.inv(H)[:POSE] @ weighted).reshape(POSE, -1, VIEW)
+    return GaussNewtonResult(T, share * inverse[:POSE, :POSE], squared, np.moveaxis(of_views, 1, 0) @ J[:, :, :POSE])

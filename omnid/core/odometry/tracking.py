@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.odometry import patch_kernels
 from omnid.core.odometry.patch_kernels import CONVERGED_PX
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
@@ -79,25 +79,14 @@ def padded(panorama: PaddedPanorama, pixels: Array) -> Array:
     return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])
 
 
-def normalised_patches(
-    panorama: PaddedPanorama, pixels: Array, side: int, step_px: int = 1, image: Floats | None = None
-) -> tuple[Floats, Floats]:
-    """Return patches (N, side^2) of zero mean and unit length about pixels (N, 2), and their standard deviations (N,).
+def correlations(images: tuple[Image, Image], at: Array, there: Array, side: int) -> Array:
+    """Return the correlations (N,) of windows about places at (N, 2) of one image with those about there of another.
 
-    Greys between pixels are interpolated; beyond the image its border is repeated. step_px: between two samples. image:
-    a padded one that is sampled in place of the panorama's. The product of two patches is their correlation.
+    A window has side^2 pixels, between which greys are interpolated; one without texture has none: 0.
     """
-    source = panorama.image if image is None else image
-    offsets = ((np.arange(side) - side // 2) * step_px).astype(np.float32)
-    columns = panorama.padded(pixels[:, :1]).astype(np.float32) + np.tile(offsets, side)
-    rows = pixels[:, 1:].astype(np.float32) + np.repeat(offsets, side)
-    patches = np.zeros(columns.shape, np.float32)
-    if len(pixels):  # OpenCV refuses empty maps
-        patches[:] = cv2.remap(source, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    patches -= patches.mean(axis=1, keepdims=True)
-    length = np.linalg.norm(patches, axis=1)
-    # A patch without contrast divides by no zero.
-    return np.asarray(patches / np.maximum(length, 1e-9)[:, None]), np.asarray(length / side)
+    found = np.empty(len(at))
+    patch_kernels.correlate(*images, at, there, side, found)
+    return found
 
 
 def correlation_peaks(before: Image, after: Image, usable: Flags, period_px: int = 0) -> list[float]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.panorama import MIN_RADIUS, Cylinder
+from omnid.core.stereo import view_kernels
 
 Array = NDArray[np.float64]
 
@@ -34,20 +34,14 @@ def view(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
 
 def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
     """Return the derivatives (N, 3, 3) [px/m] of the view (column, lower row, upper row) by the point."""
-    x, y, z = points.T
-    r2 = np.maximum(x * x + y * y, MIN_RADIUS**2)
-    r, f = np.sqrt(r2), cylinder.focal_px
-    J = np.zeros((len(points), 3, 3))
-    J[:, 0, 0], J[:, 0, 1] = f * y / r2, -f * x / r2
-    for row, height in ((1, z), (2, z - baseline_m)):
-        J[:, row, 0], J[:, row, 1], J[:, row, 2] = f * height * x / (r2 * r), f * height * y / (r2 * r), -f / r
-    return J
+    return motion_jacobian(points, cylinder, baseline_m)[:, :, :3]
 
 
 def motion_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
     """Return the derivatives (N, 3, 6) of the view by a small motion [t; r] of the point: p + t + r x p."""
-    of_point = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -se3.hat(points)], axis=2)
-    return np.asarray(view_jacobian(points, cylinder, baseline_m) @ of_point)
+    J = np.empty((len(points), 3, 6))
+    view_kernels.motion_jacobian(points, cylinder.focal_px, baseline_m, J)
+    return J
 
 
 def point_covariance(

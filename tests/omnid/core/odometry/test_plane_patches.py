@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.plane_patches import align, fitted_slopes, plane_maps, plane_templates
+from omnid.core.odometry.plane_patches import align, fitted_slopes, plane_templates
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
@@ -74,8 +74,7 @@ def seen_at(points: Array, upper: bool) -> Array:
 
 
 def templates_of(surfaces: tuple[Array, Array], pixels: Array, seen: Array, *, upper: bool) -> NDArray[np.float32]:
-    T = np.tile(T_CURR_REF, (len(pixels), 1, 1))
-    return 128 + plane_templates(panorama(np.eye(4)), pixels, plane_maps(surfaces, T, seen, MODEL, upper=upper))
+    return 128 + plane_templates(panorama(np.eye(4)), pixels, surfaces, T_CURR_REF, seen, MODEL, upper=upper)
 
 
 @pytest.mark.parametrize("upper", [False, True])
