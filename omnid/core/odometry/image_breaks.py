@@ -225,8 +225,8 @@ def _flow(
         #    torn images show them. Their patches are aligned, bent as the step bends them.
         own, of_shift = ([0, 1], [0, 1]) if camera == 0 else ([0, 2], [3, 2])
         start, end = (at[:, own] - shift.px[:, of_shift] for at, shift in zip(pixels, shifts, strict=True))
-        raw, by_raw = raw_image.at(end)
-        inside = np.isfinite(raw).all(axis=1)
+        raw, by_raw = raw_image.at(end), raw_image.derivatives(end)
+        inside = np.isfinite(raw).all(axis=1) & np.isfinite(by_raw).all(axis=(1, 2))
         for at in (start, end):
             inside &= np.abs(at[:, 1] - cylinder.height / 2) < (cylinder.height - WINDOW_PX - 2) / 2
             inside &= cylinder.shows(at[:, 0])

@@ -22,6 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.panorama import at_pixels
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.pose_estimation import CORRELATED, KERNEL_WIDTH, VIEW
@@ -50,19 +51,21 @@ class RawImage:
         """u, v (H, W): raw column and row of each pixel, -1: none; size: columns and rows of the raw image."""
         self._maps, self.size = (u, v), size
 
-    def at(self, pixels: Array) -> tuple[Array, Array]:
-        """Return raw pixels (N, 2) of pixels (N, 2), NaN: none, and the derivatives (N, 2, 2) of pixels by raw ones."""
+    def at(self, pixels: Array) -> Array:
+        """Return raw pixels (N, 2) of pixels (N, 2), NaN: none."""
+        raw = np.column_stack([at_pixels(table, pixels) for table in self._maps]).astype(float)
+        return np.where((raw >= 0).all(axis=1, keepdims=True), raw, np.nan)
+
+    def derivatives(self, pixels: Array) -> Array:
+        """Return the derivatives (N, 2, 2) of pixels (N, 2) by raw ones, NaN: raw pixels hardly change around them."""
         height, width = self._maps[0].shape
         column, row = np.rint(pixels).astype(np.intp).T
         column, row = np.clip(column, 2, width - 3), np.clip(row, 2, height - 3)
-        raw = np.column_stack([table[row, column] for table in self._maps]).astype(float)
         across = np.column_stack([table[row, column + 2] - table[row, column - 2] for table in self._maps]) / 4.0
         down = np.column_stack([table[row + 2, column] - table[row - 2, column] for table in self._maps]) / 4.0
-        determinant = across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]
-        is_shown = (raw >= 0).all(axis=1) & (np.abs(determinant) > 1e-3)
-        determinant = np.where(is_shown, determinant, 1.0)
-        adjugate = np.array([[down[:, 1], -down[:, 0]], [-across[:, 1], across[:, 0]]])
-        return np.where(is_shown[:, None], raw, np.nan), np.moveaxis(adjugate / determinant, 2, 0)
+        of_raw = np.stack([across, down], axis=2).astype(float)
+        of_raw[np.abs(np.linalg.det(of_raw)) <= 1e-3] = np.nan
+        return np.linalg.inv(of_raw)
 
 
 class ReadOut(NamedTuple):
@@ -110,18 +113,18 @@ class LineTimes:
         at_anchor, R = table.anchor_points[rows], T_curr_anchor[:, :3, :3]
         error = seen.views[chosen] - view(points, cylinder, baseline_m)
         error[:, 0] = cylinder.wrap(error[:, 0])
-        J = view_jacobian(points, cylinder, baseline_m)
+        of_motion = motion_jacobian(points, cylinder, baseline_m)
+        J = of_motion[:, :, :3]
         anchors, group = np.unique(table.anchor[rows], return_inverse=True)
         velocities = np.array([known[key] for key in anchors.tolist()]).reshape(-1, 6)[group]
         J_anchor = view_jacobian(at_anchor, cylinder, baseline_m)
         by_now, moved = self._shifts(points, J, velocity)
         by_anchor, _ = self._shifts(at_anchor, J_anchor, velocities)
         by_times = by_now - J @ R @ np.linalg.solve(J_anchor, by_anchor)
-        of_pose = -motion_jacobian(points, cylinder, baseline_m)
         # 3. Whitened, with the weights of the pose's kernel.
         S = self._model.sigma_px**2 * np.eye(3) + J @ R @ table.anchor_covariance[rows] @ np.swapaxes(J @ R, 1, 2)
         S[:, 2, 2] += seen.variance[chosen]
-        rest = np.concatenate([of_pose, by_times, error[:, :, None]], axis=2)
+        rest = np.concatenate([-of_motion, by_times, error[:, :, None]], axis=2)
         usable = np.isfinite(rest).all(axis=(1, 2)) & np.isfinite(S).all(axis=(1, 2))
         if not usable.any():
             return
@@ -165,7 +168,7 @@ class LineTimes:
         motion = -(J @ (velocity[..., :3] + np.cross(velocity[..., 3:], points))[:, :, None])[:, :, 0]
         seen, times = view(points, self._model.cylinder, self._model.baseline_m), np.zeros((len(points), 3, LAG + 1))
         for camera, of_view in enumerate((slice(0, 2), slice(2, 3))):
-            raw, _ = self._raws[camera].at(seen[:, [0, 1 + camera]])
+            raw = self._raws[camera].at(seen[:, [0, 1 + camera]])
             times[:, of_view, camera] = raw[:, 1:] / self._raws[camera].size[1] - 0.5
         times[:, 2, LAG] = 1.0
         return motion[:, :, None] * times, motion

@@ -35,20 +35,8 @@ MAX_SLOPE = 0.7  # Largest slope of a disparity: steeper planes are seen too obl
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
 
 
-@compiled(
-    "(u1[:, ::1], f8[:, ::1], f8[:, :], f8[:, :], f8[:, :], f8[:, :], UniTuple(f8, 3), f4[:, :, ::1])",
-    writes=("templates",),
-)
-def sample(
-    image: Image,
-    centres: Array,
-    points: Array,
-    slopes: Array,
-    T_curr_ref: Array,
-    predicted: Array,
-    lengths: Vector,
-    templates: Floats,
-) -> None:
+@compiled("(u1[:, ::1], f8[:, ::1], f8[:, :], f8[:, :], UniTuple(f8, 3), f4[:, :, ::1])", writes=("templates",))
+def sample(image: Image, centres: Array, planes: Array, T: Array, lengths: Vector, templates: Floats) -> None:
     """Write the templates (N, T, T) of patches of an image.
 
     centres (N, 2) [px] in the image; the others: see `write_map`.
@@ -64,7 +52,7 @@ def sample(
     nodes, powers = np.empty((2, 3, 3)), np.empty((2, 3, 3))
     columns, rows = powers[0], powers[1]
     for n in range(len(templates)):
-        write_map(points[n], slopes[n], T_curr_ref, predicted[n], lengths, half, nodes, powers)
+        write_map(planes[n], T, lengths, half, nodes, powers)
         reach_px = max(reach_of(columns, half), reach_of(rows, half))
         # A place that is unknown or outside has no template.
         if not (0 <= centres[n, 0] < image.shape[1] and 0 <= centres[n, 1] < image.shape[0]) or math.isnan(reach_px):
@@ -130,18 +118,16 @@ def write_moved_slopes(points: Array, slopes: Array, T_curr_ref: Array, baseline
 
 
 @inner
-def write_map(
-    p: Array, slopes: Array, T: Array, predicted: Array, lengths: Vector, half: int, nodes: Array, powers: Array
-) -> None:
+def write_map(plane: Array, T: Array, lengths: Vector, half: int, nodes: Array, powers: Array) -> None:
     """Write powers (2, 3, 3) of rows and columns from a template's middle, for those from the patch's centre.
 
-    p (3,), slopes (2,): the plane in the frame of the patch. T: from there to the current one, which shows p at
-    predicted (2,). lengths: focal length [px], baseline, height of the current viewpoint above the lower one [m].
+    plane (7,): its point and its slopes in the frame of the patch, and where the current view shows the point [px]. T:
+    to the current frame. lengths: focal length [px], baseline, height of the current viewpoint above the lower one [m].
     half: of a template [px]. nodes: room for (2, 3, 3).
     """
     # 1. The plane n' . (p' - o') = scale, and the point, from the current viewpoint o'.
-    focal_px, baseline_m, height_m = lengths
-    n, (x, y, z) = turned(T, normal_of(p, slopes, baseline_m)), moved(T, p)
+    (focal_px, baseline_m, height_m), p, predicted = lengths, plane[:3], plane[5:]
+    n, (x, y, z) = turned(T, normal_of(p, plane[3:5], baseline_m)), moved(T, p)
     t = T[0, 3], T[1, 3], T[2, 3] - height_m
     scale = 1 + n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
     r, azimuth, rise = math.hypot(p[0], p[1]), math.atan2(y, x), (z - height_m) / math.hypot(x, y)

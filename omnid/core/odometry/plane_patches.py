@@ -75,7 +75,8 @@ def plane_templates(
     """
     templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
     lengths = model.cylinder.focal_px, model.baseline_m, model.baseline_m if upper else 0.0
-    patch_kernels.sample(image.image, padded(image, pixels), *surfaces, T_curr_ref, predicted, lengths, templates)
+    planes = np.column_stack([*surfaces, predicted])
+    patch_kernels.sample(image.image, padded(image, pixels), planes, T_curr_ref, lengths, templates)
     return templates
 
 

@@ -141,18 +141,20 @@ def gauss_newton(
     cylinder, focal_px = model.cylinder, model.cylinder.focal_px
     column0 = cylinder.left_rad * focal_px - 0.5
     camera = focal_px, column0, cylinder.row0, float(cylinder.period_px), model.baseline_m
-    views, error, e = np.nan_to_num(views), np.zeros(size - POSE), np.empty(views.shape)
-    J = np.concatenate([np.zeros((len(views), VIEW, POSE)), -by_error], axis=2)
-    informed, squared = information @ J, np.empty(len(views))
+    views, error, blank = np.nan_to_num(views), np.zeros(size - POSE), np.zeros((len(views), VIEW, POSE))
+    E = np.concatenate([blank, -by_error, blank[:, :, :1]], axis=2)
+    informed = information @ E
     for number in range(GAUSS_NEWTON_STEPS + 1):
-        # The errors e = v - view(T p) + D s, and their derivatives -J by [t; r] on the left of T and by s.
-        view_kernels.compare(T, landmarks, views + by_error @ error, information, camera, e, J, informed, squared)
+        # E = [J, e]: errors e = v - view(T p) + D s, and their derivatives -J by [t; r] on the left of T and by s.
+        view_kernels.compare(T, landmarks, views + by_error @ error, information, camera, E, informed)
+        squared = (E[:, :, -1] * informed[:, :, -1]).sum(axis=1)
         weight = 1 / (1 + squared / KERNEL_WIDTH**2)
         is_right = squared < OUTLIER_SQUARED
         if number >= OUTLIER_STEPS and is_right.sum() >= POSE:  # fewer leave the equations singular
             weight = np.where(is_right, weight, 0.0)
-        weighted = (informed * weight[:, None, None]).reshape(-1, size).T
-        H, g = prior + weighted @ J.reshape(-1, size), weighted @ e.ravel() - prior[:, POSE:] @ error
+        weighted = (informed[:, :, :size] * weight[:, None, None]).reshape(-1, size).T
+        sums = weighted @ E.reshape(-1, size + 1)
+        H, g = prior + sums[:, :size], sums[:, size] - prior[:, POSE:] @ error
         if number == GAUSS_NEWTON_STEPS:
             break
         step = np.linalg.inv(H) @ g
@@ -167,4 +169,4 @@ def gauss_newton(
     inverse = np.asarray(np.linalg.inv(H + (share - 1) * prior), float)
     # 4. A motion of a landmark changes its error by J, and the solution by H^-1 J^T S^-1 J.
     of_views = (np.linalg.inv(H)[:POSE] @ weighted).reshape(POSE, -1, VIEW)
-    return GaussNewtonResult(T, share * inverse[:POSE, :POSE], squared, np.moveaxis(of_views, 1, 0) @ J[:, :, :POSE])
+    return GaussNewtonResult(T, share * inverse[:POSE, :POSE], squared, np.moveaxis(of_views, 1, 0) @ E[:, :, :POSE])

@@ -58,33 +58,24 @@ def moved(T: Array, p: Array) -> Vector:
 
 
 @compiled(
-    "(f8[:, :], f8[:, :], f8[:, :], f8[:, :, ::1], UniTuple(f8, 5), f8[:, :], f8[:, :, ::1], f8[:, :, ::1], f8[::1])",
-    writes=("e", "J", "informed", "squared"),
+    "(f8[:, :], f8[:, :], f8[:, :], f8[:, :, ::1], UniTuple(f8, 5), f8[:, :, ::1], f8[:, :, ::1])",
+    writes=("E", "informed"),
 )
-def compare(
-    T: Array,
-    points: Array,
-    views: Array,
-    information: Array,
-    camera: Camera,
-    e: Array,
-    J: Array,
-    informed: Array,
-    squared: Array,
-) -> None:
-    """Write the errors e (N, 3) of views of points T p, and e^T S^-1 e (N,); the first six columns of J and S^-1 J."""
+def compare(T: Array, points: Array, views: Array, weights: Array, camera: Camera, E: Array, informed: Array) -> None:
+    """Write [J, ..., e] to E (N, 3, 7 + K): the errors of views (N, 3) of points T p, and -J their first derivatives.
+
+    informed (N, 3, 7 + K): the same columns of the weights (N, 3, 3) times E.
+    """
     focal_px, column0, row0, turn_px, baseline_m = camera
     for n in range(len(points)):
         x, y, z = moved(T, points[n])
         r = max(math.sqrt(x * x + y * y), MIN_RADIUS)
         across = views[n, 0] - column0 + focal_px * math.atan2(y, x)
-        e[n, 0] = across - turn_px * math.floor(across / turn_px + 0.5)
-        e[n, 1] = views[n, 1] - row0 + focal_px * z / r
-        e[n, 2] = views[n, 2] - row0 + focal_px * (z - baseline_m) / r
-        write_motion_jacobian(x, y, z, focal_px, baseline_m, J[n])
-        squared[n] = 0.0
+        write_motion_jacobian(x, y, z, focal_px, baseline_m, E[n])
+        E[n, 0, -1] = across - turn_px * math.floor(across / turn_px + 0.5)
+        E[n, 1, -1] = views[n, 1] - row0 + focal_px * z / r
+        E[n, 2, -1] = views[n, 2] - row0 + focal_px * (z - baseline_m) / r
         for i in range(3):
-            S = information[n, i]
-            squared[n] += e[n, i] * (S[0] * e[n, 0] + S[1] * e[n, 1] + S[2] * e[n, 2])
-            for a in range(6):
-                informed[n, i, a] = S[0] * J[n, 0, a] + S[1] * J[n, 1, a] + S[2] * J[n, 2, a]
+            W = weights[n, i]
+            for a in range(-1, 6):
+                informed[n, i, a] = W[0] * E[n, 0, a] + W[1] * E[n, 1, a] + W[2] * E[n, 2, a]
