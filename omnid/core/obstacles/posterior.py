@@ -77,11 +77,12 @@ def ray_belief(shown: ShownBins, bins: Bins, sensor_grey: float, known: Flags) -
     #    how much.
     floor = shown.floor - np.float32(min(max(float(np.median(shown.floor[near])), -1.0), 0.0))
     floor = P.w_floor * np.clip(floor, -P.floor_most, P.floor_most)
-    # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L counts
-    # by the odds that it is more than that.
+    # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L for
+    # such a plane counts by the odds that it is more than that.
     levels = np.stack([shown.levels[0], _along_edges(shown.levels[1], ranges_m)])
-    noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
-    levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
+    beside = np.minimum(levels, 0)
+    noise2 = np.square(beside[:, near]).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
+    levels = levels - beside * np.exp(-np.square(beside) / (2 * noise2))
     levels = floor - P.w_level * np.clip(levels, -P.level_most, P.level_most)
     fits = np.minimum(shown.fits, P.surface_most) - P.surface_noise
     # 3. Edges and look, by those of the floor.
