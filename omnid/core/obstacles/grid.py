@@ -11,7 +11,8 @@ hanging, or a step), and whether they are known.
 3. Hidden Markov prediction: an obstacle comes into a cell with a small probability in each pair, so L has a lower
    bound; and unobserved cells may be entered from unknown ones, at 1.6 m/s by a person, 25 cm wide.
 4. Too near to be seen: known by what is seen past a cell. What hides the nearest floor in view may be anywhere
-   before it, unless an obstacle is known there.
+   before it, unless an obstacle is known there. It has left when that floor is seen again; what is low hid none, and
+   stays.
 5. Arrivals: the first obstacle of a direction, where the floor was free a short while ago.
 """
 
@@ -52,6 +53,7 @@ class GridParameters:
     same_place: float = 0.9  # rho: correlation of the errors of pairs from one place, 0 after the way of a cell
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
+    outline_cells: int = 2  # around what has left, by which rays are wider than its outline
     strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
     wall_rad: float = 0.5  # least half of the angle that a wall hides which is too near to be seen
@@ -65,6 +67,7 @@ class GridParameters:
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
     surface_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
+    hanging_most: float = 0.3  # most that is kept of it, so that what has left is forgotten within some views
     hanging_least: float = 0.08  # mean from which something hangs there,
     hanging_weight: float = 30.0  # and its log-odds by this mean
     arrival_surface: float = 0.07  # mean from which something that hangs has come onto floor that was free
@@ -161,12 +164,13 @@ class ObstacleGrid:
 
     def _forget(self) -> None:
         """Forget everything."""
-        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf], np.float32)
+        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf, 0], np.float32)
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of an obstacle; evidence of the pair before; mean of what single pairs show; whether a cell is known;
-        # views past it; whether the last pair saw floor behind it; time [s] since it was free.
+        # views past it; whether the last pair saw floor behind it; time [s] since it was free; views in which
+        # it hid the nearest floor, less those past it.
         self.odds, self._before, self._surface, self._known, *others = self._layers
-        self._past_views, self._was_past, self._free_s = others
+        self._past_views, self._was_past, self._free_s, self._hiding = others
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
@@ -199,7 +203,7 @@ class ObstacleGrid:
         self.odds[:] = np.where(in_view, updated, self.odds)
         self._before[:] = np.where(in_view, found[kernels.RATIO], 0)
         surface = np.float32(p.surface_rate * (1 - rho)) * (found[kernels.SURFACE] - self._surface)
-        self._surface += np.where(in_view, surface, 0)
+        self._surface[:] = np.minimum(self._surface + np.where(in_view, surface, 0), np.float32(p.hanging_most))
         # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
         #    known after so many more views past it.
         self._past_views[past] += np.float32(1 - rho)
@@ -210,6 +214,7 @@ class ObstacleGrid:
         if is_first:
             self._assume_free(columns, hides, belief)
             self._assume_walls(yaw, hides, belief)
+        self._release(hidden, past, in_view, np.float32(1 - rho))
         # 4. What hides the nearest floor in view, behind which floor was seen before, may be anywhere before it. What
         #    hides it from the start may be where it was. And somebody may come where no pair shows the floor.
         rays, things = _along(self._eye, yaw), self._things()
@@ -281,6 +286,24 @@ class ObstacleGrid:
         before = rays[self._near_m > STEPS_M][:, ~explained]
         possible.flat[before] = candidates.take(before)
         return _without_specks(possible)
+
+    def _release(self, hidden: Flags, past: Flags, in_view: Flags, views: np.float32) -> None:
+        """Release cells (SIDE, SIDE) too near to be seen whose thing hid the nearest floor in view, which is seen now.
+
+        So a person or a trolley has left, with the cells around its outline. What is low hides no floor, and stays.
+        views: of a pair.
+        """
+        p, hiding = self._p, self._hiding
+        is_past_thing = past & (self._things() > 1 / (1 + math.exp(-p.prior)))
+        hiding += np.where(hidden, views, np.where(is_past_thing, -views, 0))
+        hiding[in_view] = 0
+        has_left = past & (hiding < p.views) & (hiding + views >= p.views)
+        if has_left.any():
+            around = cv2.dilate(has_left.view(np.uint8), SQUARE, iterations=p.outline_cells)
+            has_left |= is_past_thing & (around > 0)
+            self.odds[has_left], self._surface[has_left], hiding[has_left] = p.floor, 0, 0
+        hiding[hidden & (hiding >= p.views)] = 2 * p.views
+        np.maximum(hiding, -p.views, out=hiding)
 
     def _arrivals(self, passed_s: float, rays: Rays, occupied: Floats, shows: Flags, possible: Bytes) -> Arrivals:
         """Return what has come onto floor that was free a short while ago.

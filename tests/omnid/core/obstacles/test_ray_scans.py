@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -57,11 +58,13 @@ class BaseAtRest:
         wall: Pattern = striped,
         drop_m: float = 0.0,
         lost: np.ndarray | None = None,
+        at_m: float = 0.0,
     ) -> GridScan:
-        """Return the scan after some more pairs."""
+        """Return the scan after some more pairs; at_m: how far the base has come."""
+        pose = se3.transform(np.eye(3), [at_m, 0.0, 0.0])
         for _ in range(pairs):
             lower, upper = panoramas(self.floor, wall_m, wall, drop_m, obstacle, seed=self.seq)
-            scan = self.scans.add(self.seq * PERIOD_NS, np.eye(4), lower, upper, lost)
+            scan = self.scans.add(self.seq * PERIOD_NS, pose, lower, upper, lost)
             self.seq += 1
         assert scan is not None
         return scan
@@ -182,6 +185,28 @@ def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Patte
     base.scan(pairs=8)
     assert base.scan(Pole(1.5, 0.08), pairs=15).free_m[AHEAD].min() < 1.65
     assert np.median(base.scan(pairs=12).free_m[AHEAD]) > 0.75 * WALL_M
+
+
+def approached(floor: Pattern, obstacle: Callable[[float], Obstacle]) -> BaseAtRest:
+    """Return a base that has come within 0.55 m of an obstacle ahead, given by its range, and stands."""
+    base = BaseAtRest(floor)
+    for at_m in np.arange(0.0, 1.06, 0.05):
+        base.scan(obstacle(1.6 - at_m), wall_m=4.0 - at_m, at_m=at_m)
+    assert base.scan(obstacle(0.55), pairs=20, at_m=1.05).free_m[AHEAD].max() < 0.8
+    return base
+
+
+@pytest.mark.parametrize("floor", [worn, stains])
+def test_a_way_is_free_when_a_person_nearer_than_the_floor_in_view_has_left(floor: Pattern) -> None:
+    base = approached(floor, lambda range_m: Pole(range_m, 0.4, 60.0))
+    assert base.scan(pairs=40, at_m=1.05).free_m[AHEAD].min() > 1.5
+
+
+@pytest.mark.hazard("H19")
+@pytest.mark.parametrize("floor", [worn, stains])
+def test_something_low_stays_where_it_is_too_near_to_be_seen(floor: Pattern) -> None:
+    base = approached(floor, lambda range_m: Block(range_m, 0.3, 0.15))
+    assert base.scan(Block(0.55, 0.3, 0.15), pairs=80, at_m=1.05).free_m[AHEAD].max() < 0.8
 
 
 @pytest.mark.hazard("H17")
