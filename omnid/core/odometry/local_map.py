@@ -21,14 +21,8 @@ from calib import se3
 from calib.panorama import MIN_RADIUS, at_pixels
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import RigVelocity
-from omnid.core.odometry.plane_patches import (
-    REACH_PX,
-    WINDOW_PX,
-    AlignedPatches,
-    align,
-    moved_slopes,
-    plane_templates,
-)
+from omnid.core.odometry.patch_kernels import write_moved_slopes
+from omnid.core.odometry.plane_patches import REACH_PX, WINDOW_PX, AlignedPatches, align, plane_templates
 from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED, POSE
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
@@ -303,8 +297,10 @@ class LocalMap:
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:
         """Return the slopes (M, 2) of the disparity of landmarks (M,) [px/px] in a panorama with that pose."""
-        table, T_curr_ref = self.table, self.from_anchors(T_odom_rect, landmarks)
-        return moved_slopes((table.anchor_points[landmarks], table.slopes[landmarks]), T_curr_ref, self._model)
+        T_curr_ref, moved = self.from_anchors(T_odom_rect, landmarks), np.empty((len(landmarks), 2))
+        planes = self.table.anchor_points[landmarks], self.table.slopes[landmarks]
+        write_moved_slopes(*planes, T_curr_ref, self._model.baseline_m, moved)
+        return moved
 
     def error_of(self, estimate: PoseEstimate) -> Array:
         """Return the error (6, K) that the keyframes pass on to a pose: each moves its landmarks, and they the pose."""

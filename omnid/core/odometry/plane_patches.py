@@ -80,16 +80,6 @@ def plane_templates(
     return templates
 
 
-def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: StereoModel) -> Array:
-    """Return the slopes (N, 2) of the disparity in the frames to which T_curr_ref (N, 4, 4) leads.
-
-    surfaces: points (N, 3) and slopes (N, 2). Zero where the plane is seen nearly edge on.
-    """
-    moved = np.empty((len(T_curr_ref), 2))
-    patch_kernels.write_moved_slopes(*surfaces, T_curr_ref, model.baseline_m, moved)
-    return moved
-
-
 def disparity_slopes(disparity: Floats, points: Array, centre: Array) -> Array:
     """Return slopes (N, 2) of the disparity [px/px] along column and row at points (N, 2) with disparity centre (N,).
 
