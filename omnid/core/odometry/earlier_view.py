@@ -60,10 +60,8 @@ def contradicted(
         chosen &= np.abs(at[:, 1] - middle) <= middle - HALF_PX
     # 2. The correlations of both hypotheses there; they are one where the point has not moved in the image.
     here, there, images = padded(lower, pixels[chosen]), padded(lower, seen[chosen]), (lower.image, earlier.lower.image)
-    of_world = correlations(images, here, there, 2 * HALF_PX + 1)
+    of_world, of_rig = correlations(images, here, np.stack([there, here]), 2 * HALF_PX + 1)
     has_moved = np.hypot(lower.wrap(there[:, 0] - here[:, 0]), there[:, 1] - here[:, 1]) > HALF_PX
-    is_wrong, asked = of_world < LEAST, np.flatnonzero(has_moved & (of_world >= LEAST))
-    is_wrong[asked] = correlations(images, here[asked], here[asked], 2 * HALF_PX + 1) > of_world[asked]
     wrong = np.zeros(len(points), bool)
-    wrong[chosen] = is_wrong
+    wrong[chosen] = (of_world < LEAST) | (has_moved & (of_rig > of_world))
     return wrong

@@ -147,13 +147,11 @@ def displacements(
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
     # 2. Their mean correlation with the current one; those without texture have none.
     images = _halved(local_map.last), _halved(current)
-    at = np.tile(padded(local_map.last, table.pixels[rows]) / SAMPLE_PX, (len(offsets), 1))
-    scores = np.empty((len(offsets), len(offsets)))
+    at, scores = padded(local_map.last, table.pixels[rows]) / SAMPLE_PX, np.empty((len(offsets), len(offsets)))
     for a, x in enumerate(offsets):
         moved = np.concatenate([points - (x, y, 0.0) for y in offsets])
         there = padded(current, view(moved, model.cylinder, model.baseline_m)) / SAMPLE_PX
-        each = correlations(images, at, there, SAMPLES)
-        scores[a] = each.reshape(len(offsets), -1).mean(axis=1)
+        scores[a] = correlations(images, at, there.reshape(len(offsets), -1, 2), SAMPLES).mean(axis=1)
     # 3. Its peaks.
     is_peak = (scores == cv2.dilate(scores, np.ones((3, 3)))) & (scores > PEAK_SHARE * scores[steps, steps])
     return [offsets[at] for at in sorted(np.argwhere(is_peak), key=lambda at: -scores[tuple(at)])[:PEAKS]]

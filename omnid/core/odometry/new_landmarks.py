@@ -99,11 +99,9 @@ def _has_wrong_period(pair: Pair, pixels: Array, rows: Array, known: Array, most
     for n in np.flatnonzero(compared):
         at_own = np.rint(own[n]) + np.arange(-own_px, own_px + 1)
         elsewhere = np.setdiff1d(np.arange(first[n], end[n]), at_own)
-        scores = []
+        here, scores = np.rint(places[n : n + 1]), []
         for disparities in (at_own, elsewhere):
-            here = np.rint(places[n]) + np.zeros((len(disparities), 2))
-            there = here + np.outer(disparities, [0.0, 1.0])
-            is_inside = there[:, 1] <= last
-            scores.append(correlations(images, here[is_inside], there[is_inside], SIDE_PX).max(initial=-1.0))
+            there = here + np.multiply.outer(disparities, [[0.0, 1.0]])
+            scores.append(correlations(images, here, there[there[:, 0, 1] <= last], SIDE_PX).max(initial=-1.0))
         wrong[n] = len(elsewhere) > 0 and scores[1] > scores[0] - LEAST_LEAD
     return np.asarray(wrong & (len(known) > 0 or wrong.mean() > 1 - LEAST_UNIQUE_SHARE))

@@ -370,22 +370,23 @@ def write_covariance(inverse: Array, variance: float, pixels: int, covariance: A
             covariance[a, b] = NOISE_CORRELATION * variance / texture * inverse[a, b]
 
 
-@compiled("(u1[:, ::1], u1[:, ::1], f8[:, ::1], f8[:, ::1], i8, f8[::1])", writes=("found",))
+@compiled("(u1[:, ::1], u1[:, ::1], f8[:, :], f8[:, :, :], i8, f8[:, ::1])", writes=("found",))
 def correlate(a: Image, b: Image, at_a: Array, at_b: Array, side: int, found: Array) -> None:
-    """Write the correlations (N,) of windows of side^2 greys about places (N, 2) of two images; 0: no texture."""
+    """Write the correlations (K, N) of windows of side^2 greys about places (N, 2) of an image, see `correlations`."""
     pixels, least = side**2, (side**2 * MIN_CONTRAST) ** 2
     cell, size = np.zeros((side + 1) ** 2 + 1, np.int32), side * (side + 1)
     one, other = np.empty(size, np.int32), np.empty(size, np.int32)
-    for n in range(len(found)):
+    for n in range(len(at_a)):
         write_greys(a, at_a[n], side, cell, one)
-        write_greys(b, at_b[n], side, cell, other)
-        x, y, xx, yy, xy = 0, 0, 0, 0, 0
-        for k in range(len(one)):
-            x, y = x + one[k], y + other[k]
-            xx, yy, xy = xx + one[k] * one[k], yy + other[k] * other[k], xy + one[k] * other[k]
-        spread, spread_of_other = float(pixels * xx - x * x), float(pixels * yy - y * y)
-        is_textured = min(spread, spread_of_other) > least
-        found[n] = float(pixels * xy - x * y) / math.sqrt(spread * spread_of_other) if is_textured else 0.0
+        for h in range(len(at_b)):
+            write_greys(b, at_b[h, n], side, cell, other)
+            x, y, xx, yy, xy = 0, 0, 0, 0, 0
+            for k in range(size):
+                x, y = x + one[k], y + other[k]
+                xx, yy, xy = xx + one[k] * one[k], yy + other[k] * other[k], xy + one[k] * other[k]
+            spread, spread_of_other = float(pixels * xx - x * x), float(pixels * yy - y * y)
+            is_textured = min(spread, spread_of_other) > least
+            found[h, n] = float(pixels * xy - x * y) / math.sqrt(spread * spread_of_other) if is_textured else 0.0
 
 
 @inner

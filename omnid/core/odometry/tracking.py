@@ -80,11 +80,11 @@ def padded(panorama: PaddedPanorama, pixels: Array) -> Array:
 
 
 def correlations(images: tuple[Image, Image], at: Array, there: Array, side: int) -> Array:
-    """Return the correlations (N,) of windows about places at (N, 2) of one image with those about there of another.
+    """Return the correlations (K, N) of windows about places (N, 2) of one image with those there (K, N, 2) in another.
 
     A window has side^2 pixels, between which greys are interpolated; one without texture has none: 0.
     """
-    found = np.empty(len(at))
+    found = np.empty(there.shape[:2])
     patch_kernels.correlate(*images, at, there, side, found)
     return found
 
