@@ -342,7 +342,8 @@ class VisualOdometry:
         """Go on to the predicted pose."""
         self._T_odom_rect = now.T_odom_rect
         self._motion.carry(now.dt_s, is_measured=now.is_measured)
-        self._state = TrackingState.LOST if self._is_lost or self._T_at_fix is None else TrackingState.DEGRADED
+        is_known = not self._is_lost and (self._T_at_fix is not None or now.is_measured)
+        self._state = TrackingState.DEGRADED if is_known else TrackingState.LOST
 
     def _start_map(self, now: _Prediction) -> OdometryEstimate:
         """Start a map at the predicted pose if the frame has enough landmarks."""

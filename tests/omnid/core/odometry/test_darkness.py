@@ -33,12 +33,12 @@ DEGRADED, LOST, TRACKING = TrackingState.DEGRADED, TrackingState.LOST, TrackingS
 class Robot:
     """The odometry with the samples of wheels and gyro, from one frame to the next."""
 
-    def __init__(self, cameras: RenderedCameras, limits: OdometryLimits) -> None:
-        """It has seen the first four frames."""
+    def __init__(self, cameras: RenderedCameras, limits: OdometryLimits, frames: int = 4) -> None:
+        """It has seen so many first frames."""
         self._motion, self._now_s = MotionFilter(), 0.0
         relocaliser = Relocaliser(cameras.model)
         self._odometry = VisualOdometry(cameras.model, KltSettings(), limits, relocaliser, motion=self._motion)
-        for k in range(4):
+        for k in range(frames):
             self.see(cameras.frame(k, PATH[k]), AHEAD, PERIOD_S if k else 0.0)
 
     def see(self, frame: StereoFrame, sample: MotionSample | None, dt_s: float = PERIOD_S) -> OdometryEstimate:
@@ -93,6 +93,15 @@ def test_without_wheels_or_with_a_gyro_alone_darkness_is_lost(cameras: RenderedC
         # The samples of the wheels hold for a while after the last one.
         found = Robot(cameras, OdometryLimits()).dark(cameras, 6, sample)
         assert [estimate.state for estimate in found][-2:] == [LOST, LOST]
+
+
+def test_a_base_that_begins_in_the_dark_is_degraded_by_its_wheels_and_lost_without_them(
+    cameras: RenderedCameras,
+) -> None:
+    for sample, state in ((AT_REST, DEGRADED), (None, LOST)):
+        robot = Robot(cameras, OdometryLimits(), frames=0)
+        robot.see(cameras.darkness(0), None, 0.0)
+        assert {estimate.state for estimate in robot.dark(cameras, 4, sample)} == {state}
 
 
 def test_another_view_after_the_dark_starts_a_new_map_and_odom_goes_on(cameras: RenderedCameras) -> None:
