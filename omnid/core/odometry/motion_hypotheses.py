@@ -73,16 +73,13 @@ class OtherMotion:
         the predicted velocity.
         """
         # 1. Candidates that the images allow.
-        best = min(candidates, key=lambda each: each.cost)
-        likely = [
-            each for each in candidates if (each.cost - best.cost) * min(each.in_view, best.in_view) < DECIDING_COST
-        ]
-        chosen = min(likely, key=lambda each: each.distance_m(T_predicted))
+        allowed = likely(candidates)
+        chosen = min(allowed, key=lambda each: each.distance_m(T_predicted))
         # 2. The candidate farthest from it is the other motion. Where the images decide against what was predicted, the
         #    doubt goes on: that one is as far, and sought there.
         if self.is_open and chosen.distance_m(T_predicted) > REACH_SIGMAS * sigma_mps * dt_s:
             self.keep()
-        others = [each for each in likely if each.distance_m(chosen.T_odom_rect) > SAME_M]
+        others = [each for each in allowed if each.distance_m(chosen.T_odom_rect) > SAME_M]
         if others:
             off_m = self._displacement[:3] - chosen.T_odom_rect[:3, 3]
             farthest = max(others, key=lambda each: float(np.linalg.norm(off_m + each.T_odom_rect[:3, 3])))
@@ -122,6 +119,12 @@ class OtherMotion:
         """Let the other motion be one that led to another pose in dt_s since both agreed."""
         self._displacement = np.zeros(6)
         self.add(T_published, T_other, dt_s)
+
+
+def likely(candidates: list[PoseEstimate]) -> list[PoseEstimate]:
+    """Return the candidates that are at most a million to one less likely than the best one."""
+    best = min(candidates, key=lambda each: each.cost)
+    return [each for each in candidates if (each.cost - best.cost) * min(each.in_view, best.in_view) < DECIDING_COST]
 
 
 def displacements(

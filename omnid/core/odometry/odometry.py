@@ -145,7 +145,7 @@ class VisualOdometry:
     def relocalise(self, frame: StereoFrame, exposure: Exposure) -> PoseEstimate | None:
         """Return the pose of a frame among the newest keyframes, refined by the patches of the local map in view."""
         found = self._relocaliser.locate(frame)
-        return None if found is None else self._search.refine_recognised(frame, found, exposure)
+        return None if found is None else self._search.refine_recognised(frame, found, exposure, JUMP_M)
 
     def _pose(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, whose images are whole: the algorithm."""

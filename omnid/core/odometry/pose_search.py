@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import REACH_PX
-from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
+from omnid.core.odometry.estimates import SAME_M, OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.motion_hypotheses import LANDMARKS, displacements
+from omnid.core.odometry.motion_hypotheses import LANDMARKS, displacements, likely
 from omnid.core.odometry.plane_patches import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import (
     CORRELATED,
@@ -92,9 +92,9 @@ class PoseSearch:
         peaks = displacements(self._map, self._model, frame.lower, found.T_odom_rect, reach_m + off_m)
         is_good = is_good_enough(found, self._limits, is_near=False)
         others = [
-            self.estimate(frame, found.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0]), exposure, is_near=True)
-            for x, y in peaks
-            if x or y or not is_good
+            self.estimate(frame, _moved(found, *peak), exposure, is_near=True)
+            for peak in peaks
+            if peak.any() or not is_good
         ]
         return [each for each in others if each is not None and each.distance_m(T_predicted) < max(reach_m, off_m)]
 
@@ -199,21 +199,33 @@ class PoseSearch:
         )
 
     def refine_recognised(
-        self, frame: StereoFrame, recognised: PoseEstimate, exposure: Exposure
+        self, frame: StereoFrame, recognised: PoseEstimate, exposure: Exposure, reach_m: float
     ) -> PoseEstimate | None:
         """Return the pose of a frame that was recognised, by the keyframes' patches; None where too few agree.
 
-        Places are recognised by corners, whose pose errs by centimetres: the first refinement brings most patches into
-        reach, the second one aligns them all. Corners and patches are two independent supports of the pose.
+        Corners and patches are two independent supports of the pose. Along identical bricks the corners may be those of
+        others: so there is none, too, where the patches allow another pose within reach_m, from which the scene has the
+        same appearance, see motion_hypotheses.py. Farther ones have another view, which makes patches fit worse.
         """
-        refined: PoseEstimate | None = recognised
-        unknown = np.full(len(self._map), np.nan), np.zeros(len(self._map))
-        for _ in range(2):
-            refined = refined and self.refine(frame, se3.inverse(refined.T_odom_rect), exposure, *unknown)
-        if refined is None:
+        found = self._aligned(frame, recognised.T_odom_rect, exposure)
+        if found is None:
             return None
-        inliers = min(recognised.inliers, refined.inliers)
-        return replace(refined, visible=recognised.visible, tracked=recognised.tracked, inliers=inliers)
+        peaks = displacements(self._map, self._model, frame.lower, found.T_odom_rect, reach_m)
+        others = (self._aligned(frame, _moved(found, *peak), exposure) for peak in peaks if peak.any())
+        allowed = likely([found, *(each for each in others if each is not None)])
+        if any(each.distance_m(found.T_odom_rect) > SAME_M for each in allowed):
+            return None
+        inliers = min(recognised.inliers, found.inliers)
+        return replace(found, visible=recognised.visible, tracked=recognised.tracked, inliers=inliers)
+
+    def _aligned(self, frame: StereoFrame, T_odom_rect: Array, exposure: Exposure) -> PoseEstimate | None:
+        """Return the pose by the patches of all landmarks from one that errs by centimetres; None: too few agree.
+
+        The first refinement brings most patches into reach, the second one aligns them all.
+        """
+        unknown = np.full(len(self._map), np.nan), np.zeros(len(self._map))
+        coarse = self.refine(frame, se3.inverse(T_odom_rect), exposure, *unknown)
+        return coarse and self.refine(frame, se3.inverse(coarse.T_odom_rect), exposure, *unknown)
 
     def _solve(
         self,
@@ -242,3 +254,8 @@ def is_good_enough(estimate: PoseEstimate | None, limits: OdometryLimits, *, is_
         and estimate.inlier_ratio >= limits.good_inlier_ratio
         and estimate.inliers >= limits.good_inliers
     )
+
+
+def _moved(found: PoseEstimate, x_m: float, y_m: float) -> Array:
+    """Return a pose (4, 4) moved along its own axes."""
+    return found.T_odom_rect @ se3.exp([x_m, y_m, 0.0, 0.0, 0.0, 0.0])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import WheelSample
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
+from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_hypotheses import OtherMotion
 from omnid.core.odometry.odometry import VisualOdometry
@@ -68,6 +69,23 @@ def test_wheels_decide_between_two_motions(repeated: RenderedCameras) -> None:
         assert estimate.state is TrackingState.TRACKING, k
         assert motion_errors(estimate.T_odom_rect, se3.inverse(poses[0]) @ poses[k])[0] < 0.01, k
         assert estimate.covariance[0, 0] < 0.02**2, k
+
+
+@pytest.mark.parametrize("x_m", [0.1, 0.4])
+def test_a_place_is_not_claimed_where_the_world_repeats(
+    repeated: RenderedCameras, cameras: RenderedCameras, x_m: float
+) -> None:
+    """Its corners are those of another period as well."""
+    before, there = ahead(4, 0.05), ahead(1, x_m)[1]
+    for world in (repeated, cameras):
+        odometry = VisualOdometry(world.model, KltSettings(), OdometryLimits(), Relocaliser(world.model))
+        for k, T in enumerate(before):
+            odometry.process(world.frame(k, T), PERIOD_S if k else 0.0)
+        odometry.complete()
+        frame = world.frame(100, there)
+        found = odometry.relocalise(frame, Exposure(frame.times, NO_VELOCITY, world.model))
+        assert (found is None) == (world is repeated)
+        assert found is None or motion_errors(found.T_odom_rect, se3.inverse(before[0]) @ there)[0] < 2e-3
 
 
 def pose(x_m: float) -> PoseEstimate:
