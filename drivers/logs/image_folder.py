@@ -88,8 +88,8 @@ def _stamped(folder: Path) -> list[tuple[int, Path]]:
     lists = [file for place in (folder, folder.parent) for name in STAMP_LISTS if (file := place / name).is_file()]
     if lists:
         try:
-            with lists[0].open("rb") as file:
-                text = file.read(MAX_RECORD_BYTES).decode("utf-8-sig", "replace")
+            with lists[0].open("rb") as stamps:
+                text = stamps.read(MAX_RECORD_BYTES).decode("utf-8-sig", "replace")
         except OSError as error:
             raise DriverError(f"cannot read the stamps {str(lists[0])!r}: {error.strerror}") from error
         texts = [line for each in text.splitlines() if (line := each.strip()) and not line.startswith("#")]
