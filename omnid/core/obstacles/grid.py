@@ -294,14 +294,13 @@ class ObstacleGrid:
         views: of a pair.
         """
         p, hiding = self._p, self._hiding
-        is_past_thing = past & (self._things() > 1 / (1 + math.exp(-p.prior)))
-        hiding += np.where(hidden, views, np.where(is_past_thing, -views, 0))
+        hiding += np.where(hidden, views, np.where(past, -views, 0))
         hiding[in_view] = 0
         has_left = past & (hiding < p.views) & (hiding + views >= p.views)
         if has_left.any():
-            around = cv2.dilate(has_left.view(np.uint8), SQUARE, iterations=p.outline_cells)
-            has_left |= is_past_thing & (around > 0)
-            self.odds[has_left], self._surface[has_left], hiding[has_left] = p.floor, 0, 0
+            around = cv2.dilate(has_left.view(np.uint8), SQUARE, iterations=p.outline_cells) > 0
+            released = around & past & (self._things() > 1 / (1 + math.exp(-p.prior)))
+            self.odds[released], self._surface[released], hiding[released] = p.floor, 0, 0
         hiding[hidden & (hiding >= p.views)] = 2 * p.views
         np.maximum(hiding, -p.views, out=hiding)
 
