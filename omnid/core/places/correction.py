@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.places.place_map import Link, PlaceMap, relative_covariance
+from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap, relative_covariance
 from omnid.core.places.pose_graph import PoseEdges, optimise
 
 Array = NDArray[np.float64]
@@ -23,21 +22,12 @@ RECENT: Final = 8  # Newest loops, because they show the present drift; a refuse
 QUANTILE, EXPECTED = 0.75, 7.841
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Anchor:
-    """A keyframe whose covariance in the map is known."""
-
-    T_odom_rect: Array
-    of_odom: Array  # (6, 6) covariance in odom
-    of_map: Array  # (6, 6) covariance in the map
-
-
 class MapCorrection:
     """Optimises the poses of a map when loops are closed."""
 
     def __init__(self, places: PlaceMap) -> None:
         self._places = places
-        self._anchor: _Anchor | None = None
+        self._anchor: tuple[PlaceKeyframe, Array] | None = None  # a keyframe, and its covariance (6, 6) in the map
         self._is_due = False  # the next loop says how well the place of odom in the map is known
         self._waiting = 0  # loops since the last optimisation
         self.factor = 1.0  # factor on odometry's covariance that the loops show
@@ -87,9 +77,8 @@ class MapCorrection:
         bad = {id(links[n]) for n in np.flatnonzero(~result.accepted)}.difference(recent)
         places.links = [link for link in places.links if id(link) not in bad]
         # 5. The covariance of later poses in the map.
-        newest = places.keyframes[part[-1]]
         if np.isfinite(result.covariance).all():
-            self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
+            self._anchor = places.keyframes[part[-1]], result.covariance
 
     def _fits(self, loop: Link) -> bool:
         """True if the poses of a map agree with a loop within its own sigma."""
@@ -101,10 +90,11 @@ class MapCorrection:
         """Return the covariance (6, 6) in the map of a pose whose covariance in odom is given."""
         if self._anchor is None:
             return covariance
-        T_anchor_rect = se3.inverse(self._anchor.T_odom_rect) @ T_odom_rect
+        anchor, of_map = self._anchor
+        T_anchor_rect = se3.inverse(anchor.T_odom_rect) @ T_odom_rect
         A = se3.adjoint(se3.inverse(T_anchor_rect))
-        since = relative_covariance(T_anchor_rect, self._anchor.of_odom, covariance)
-        return np.asarray(A @ self._anchor.of_map @ A.T + self.factor * since)
+        since = relative_covariance(T_anchor_rect, anchor.covariance, covariance)
+        return np.asarray(A @ of_map @ A.T + self.factor * since)
 
     def _drift_factor(self, links: list[Link]) -> float:
         """Return the factor on odometry's covariance that explains the loops within one run."""

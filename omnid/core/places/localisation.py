@@ -148,7 +148,7 @@ class MapLocaliser:
         self._path_m = self._confirmed_m = 0.0  # m: the path, and that at the last search before contradictions
         self._path_at: dict[int, float] = {}  # m, of the keyframes of this run
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
-        self._last_T: Array | None = None
+        self._last_T = np.eye(4)
         self._searched: tuple[int, Array] | None = None  # stamp and T_odom_rect of the last search
         self.failed = 0  # searches in a row, in this part of the map, that found nothing
         self._part: frozenset[int] | None = None  # keyframes that links join to the newest one; None: not known
@@ -193,13 +193,7 @@ class MapLocaliser:
         Of a map that stays as it is, its own ones only. The same object until they change.
         """
         if self._scans is None:
-            ids = sorted(self._fixed & self._current or self._current)
-            shown = [self.places.keyframes[id] for id in ids]
-            self._scans = KeyframeScans(
-                {keyframe.id: keyframe.scan for keyframe in shown},
-                {keyframe.id: keyframe.free_m for keyframe in shown},
-                np.array([self.places.poses[id] for id in ids]).reshape(-1, 4, 4),
-            )
+            self._scans = self.places.scans(sorted(self._fixed & self._current or self._current))
         return self._scans
 
     @property
@@ -220,14 +214,11 @@ class MapLocaliser:
     def _map_changed(self) -> None:
         """Forget what was computed of the map before it changed."""
         self._part = self._scans = None
-        if len(self._path_at.keys() - self.places.keyframes.keys()):
-            self._path_at = {id: at for id, at in self._path_at.items() if id in self.places.keyframes}
-        self.search.forget_dropped(self.places)
+        self._path_at = {id: at for id, at in self._path_at.items() if id in self.places.keyframes}
 
     def _advance(self, frame: OdometryFrame) -> None:
         """Sum up the path; after a gap of unknown motion, noticed or not, begin a new part of the map."""
-        if self._last_T is not None:
-            self._path_m += motion_between(self._last_T, frame.T_odom_rect)[0]
+        self._path_m += motion_between(self._last_T, frame.T_odom_rect)[0]
         self._last_T = frame.T_odom_rect
         is_wrong = self.search.contradicted >= SEARCHES
         if is_wrong:  # and so are the keyframes since the first contradiction

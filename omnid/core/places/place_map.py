@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
+from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.core.places.pose_graph import connected
 
 Array = NDArray[np.float64]
@@ -54,7 +55,7 @@ class PlaceFeatures:
         return PlaceFeatures(self.descriptors[:count], self.views[:count])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class PlaceKeyframe:
     """Evidence by which a place is recognised; the rectified frame is that of the lower panorama."""
 
@@ -136,6 +137,12 @@ class PlaceMap:
     def positions(self, ids: Sequence[int]) -> Array:
         """Return the positions (N, 3) of keyframes in the map."""
         return np.array([self.poses[id][:3, 3] for id in ids]).reshape(-1, 3)
+
+    def scans(self, ids: Sequence[int]) -> KeyframeScans:
+        """Return the range scans of keyframes, in the order of their ids given."""
+        shown = {id: self.keyframes[id] for id in ids}
+        scans, free_m = ({id: getattr(each, of) for id, each in shown.items()} for of in ("scan", "free_m"))
+        return KeyframeScans(scans, free_m, np.array([self.poses[id] for id in ids]).reshape(-1, 4, 4))
 
     def parts(self) -> list[list[int]]:
         """Return the ids of the keyframes that links join, part by part, the largest first, ids ascending.

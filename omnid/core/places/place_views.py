@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.range_scan import MAX_RANGE_M
-from omnid.core.mapping.scan_grid import MAX_CELLS, Grid, KeyframeGrid, KeyframeScans
+from omnid.core.mapping.scan_grid import MAX_CELLS, Grid, KeyframeGrid
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
 from omnid.core.places.place_map import PlaceMap, PlaceRig
 from omnid.core.places.pose_graph import connected
@@ -41,10 +41,7 @@ def _of_base(T_map_rect: Array, rig: PlaceRig) -> Array:
 def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
     """Return the occupancy grid of the keyframes' range scans and free floor, the newest evidence last."""
     ids = sorted(places.keyframes, key=lambda id: (places.keyframes[id].session, places.keyframes[id].stamp_ns, id))
-    shown = {id: places.keyframes[id] for id in ids}
-    scans, free_m = ({id: getattr(each, of) for id, each in shown.items()} for of in ("scan", "free_m"))
-    poses = np.array([places.poses[id] for id in ids]).reshape(-1, 4, 4)
-    return KeyframeGrid(cell_m, MAX_CELLS).draw(KeyframeScans(scans, free_m, poses), rig.T_base_rect)
+    return KeyframeGrid(cell_m, MAX_CELLS).draw(places.scans(ids), rig.T_base_rect)
 
 
 def landmarks(places: PlaceMap, rig: PlaceRig, voxel_m: float) -> MapPoints:

@@ -9,7 +9,7 @@ full or not at all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -48,15 +48,10 @@ class PoseGraphResult:
     """Poses after the optimisation, and the edges that agree with them."""
 
     poses: Array  # (N, 4, 4)
-    weights: Array  # (M,) 1 for odometry, 0 to 1 for loops
+    accepted: Flags  # (M,) edges that agree
     # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite if neither odometry nor accepted
     # loops join it to one of them.
     covariance: Array
-
-    @property
-    def accepted(self) -> Flags:
-        """Edges (M,) that agree; the middle decides, because weights end at 0 or 1."""
-        return np.asarray(self.weights > 0.5)
 
 
 def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> PoseGraphResult:
@@ -83,10 +78,11 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
         if is_decided and float(np.abs(change).max()) < CONVERGED:
             break
         mu *= 2  # Yang et al. take 1.4
-    result = PoseGraphResult(poses, weights, np.full((6, 6), np.inf))
-    parts = connected(range(len(poses)), edges.pairs[result.accepted])
+    accepted = weights > 0.5  # the middle decides, because weights end at 0 or 1
+    parts = connected(range(len(poses)), edges.pairs[accepted])
     last = next(part for part in parts if part[-1] + 1 == len(poses))
-    return replace(result, covariance=graph.last_covariance(J, weights)) if fixed[last].any() else result
+    is_joined = fixed[last].any()
+    return PoseGraphResult(poses, accepted, graph.last_covariance(J, weights) if is_joined else np.full((6, 6), np.inf))
 
 
 class _Graph:

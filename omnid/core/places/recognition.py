@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,7 @@ from omnid.core.odometry.local_map import Keyframe
 from omnid.core.odometry.pose_estimation import CORRELATED, OUTLIER_SQUARED, GaussNewtonResult, gauss_newton, ransac
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import FEATURES, Signature, Thumbnail, describe, signature_of, similarities
-from omnid.core.places.place_map import PlaceFeatures, PlaceLimits, PlaceMap
+from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceLimits, PlaceMap
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 
@@ -104,7 +106,7 @@ class PlaceSearch:
 
     def __init__(self, model: StereoModel) -> None:
         self._model = model
-        self._signatures: dict[int, Signature] = {}
+        self._signatures = WeakKeyDictionary[PlaceKeyframe, Signature]()
         self.contradicted = 0  # recognitions in a row that odometry contradicts
 
     def find(
@@ -121,10 +123,11 @@ class PlaceSearch:
             effort, ids = FAR, where
         # 1. The most similar thumbnails.
         if ids:
-            for id in ids:
-                if id not in self._signatures:
-                    self._signatures[id] = signature_of(places.keyframes[id].thumbnail)
-            others = np.array([self._signatures[id] for id in ids])
+            keyframes = [places.keyframes[id] for id in ids]
+            for each in keyframes:
+                if each not in self._signatures:
+                    self._signatures[each] = signature_of(each.thumbnail)
+            others = np.array([self._signatures[each] for each in keyframes])
             ranked = np.argsort(-similarities(signature_of(small), others), kind="stable")
             ids = [ids[n] for n in ranked[: effort.voted].tolist()]
         # 2. Votes and geometry of these: the best one, unless another place is as similar.
@@ -136,10 +139,6 @@ class PlaceSearch:
         is_confirmed = where.confirms(best, places.poses)
         self.contradicted = 0 if is_confirmed else self.contradicted + 1
         return best if is_confirmed else None
-
-    def forget_dropped(self, places: PlaceMap) -> None:
-        """Forget the keyframes that the map does not hold any more."""
-        self._signatures = {id: found for id, found in self._signatures.items() if id in places.keyframes}
 
 
 def search(
@@ -286,32 +285,26 @@ class Relocaliser:
 
     def __init__(self, model: StereoModel) -> None:
         self._model = replace(model, cylinder=model.cylinder.full_turn)  # Columns of features are those of a full turn.
-        self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=FAR.compared)
-        self._features: dict[int, PlaceFeatures] = {}
+        self._kept: deque[tuple[Keyframe, Callable[[], PlaceFeatures]]] = deque(maxlen=FAR.compared)
 
     def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
         """Keep a frame and its keyframe; one near the last keyframe replaces it. It is described when it is needed."""
         if self._kept:
-            apart_m = self._kept[-1][1].T_odom_rect[:3, 3] - keyframe.T_odom_rect[:3, 3]
+            apart_m = self._kept[-1][0].T_odom_rect[:3, 3] - keyframe.T_odom_rect[:3, 3]
             if np.linalg.norm(apart_m) < PlaceLimits().keyframe_m:
                 self._kept.pop()
         # A function of disparities keeps all evidence of its pair.
-        self._kept.append((replace(frame, disparities=frame.disparity), keyframe))
+        self._kept.append((keyframe, cache(partial(describe, replace(frame, disparities=frame.disparity)))))
 
     def clear(self) -> None:
         """Remove all keyframes."""
         self._kept.clear()
-        self._features.clear()
 
     def locate(self, frame: StereoFrame) -> PoseEstimate | None:
         """Return the pose with the most inliers; None where no keyframe is recognised. The keyframe is exact."""
-        # 1. Describe the frame, and the keyframes that no search has described before.
-        features = describe(frame)
-        self._features = {kept.seq: self._features.get(kept.seq) or describe(kept) for kept, _ in self._kept}
-        # 2. Search it among them, as in the map of places.
-        poses = {keyframe.seq: keyframe.T_odom_rect for _, keyframe in self._kept}
-        effort = NEAR._replace(compared=len(poses))
-        best = search(features, self._features, poses, effort, self._model)
+        known = {keyframe.seq: features() for keyframe, features in self._kept}
+        poses = {keyframe.seq: keyframe.T_odom_rect for keyframe, _ in self._kept}
+        best = search(describe(frame), known, poses, NEAR._replace(compared=len(poses)), self._model)
         if best is None:
             return None
         matches = max(best.matches, best.inliers)
