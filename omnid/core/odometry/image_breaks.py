@@ -35,7 +35,7 @@ from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 from omnid.core.odometry.plane_patches import WINDOW_PX, align, plane_templates
 from omnid.core.odometry.pose_estimation import CORRELATED, DAMPING, GAUSS_NEWTON_STEPS, OUTLIER_SQUARED, VIEW, cost
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.stereo.triangulation import motion_jacobian, view, view_jacobian
+from omnid.core.stereo.triangulation import motion_jacobian, view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
@@ -216,9 +216,8 @@ def _flow(
     seen = [se3.apply(se3.inverse(each.T_odom_rect), points) for each in views]
     shifts = [each.exposure.shift(at) for each, at in zip(views, seen, strict=True)]
     pixels = [view(at, cylinder, baseline_m) for at in seen]
-    J_before, J_now = (view_jacobian(at, cylinder, baseline_m) for at in seen)
-    of_step = -motion_jacobian(seen[1], cylinder, baseline_m)
-    of_point = J_now @ now.T_odom_rect[:3, :3].T - J_before @ last.T_odom_rect[:3, :3].T
+    before, after = (motion_jacobian(at, cylinder, baseline_m) for at in seen)
+    of_point = after[:, :, :3] @ now.T_odom_rect[:3, :3].T - before[:, :, :3] @ last.T_odom_rect[:3, :3].T
     parts, sought = [], 0
     for camera, raw_image in enumerate(raws):
         # 1. Landmarks that both pairs show, tracked from where the step predicts them, else as if the rig had stood, as
@@ -252,7 +251,7 @@ def _flow(
         # 2. Derivatives, in standard deviations.
         noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], covariance[rows], of_point[rows][:, own])
         px = np.sqrt(SIGMA_PX**2 + noise.mean(axis=1))
-        J, of_raw = of_step[rows][:, own] / px[:, None, None], by_raw[rows] / px[:, None, None]
+        J, of_raw = -after[rows][:, own] / px[:, None, None], by_raw[rows] / px[:, None, None]
         size = np.array(raw_image.size)
         arm = raw[rows] - (size - 1) / 2
         turn = of_raw @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]

@@ -26,7 +26,7 @@ from calib.panorama import at_pixels
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.pose_estimation import CORRELATED, KERNEL_WIDTH, VIEW
-from omnid.core.stereo.triangulation import motion_jacobian, view, view_jacobian
+from omnid.core.stereo.triangulation import motion_jacobian, view
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -117,7 +117,7 @@ class LineTimes:
         J = of_motion[:, :, :3]
         anchors, group = np.unique(table.anchor[rows], return_inverse=True)
         velocities = np.array([known[key] for key in anchors.tolist()]).reshape(-1, 6)[group]
-        J_anchor = view_jacobian(at_anchor, cylinder, baseline_m)
+        J_anchor = motion_jacobian(at_anchor, cylinder, baseline_m)[:, :, :3]
         by_now, moved = self._shifts(points, J, velocity)
         by_anchor, _ = self._shifts(at_anchor, J_anchor, velocities)
         by_times = by_now - J @ R @ np.linalg.solve(J_anchor, by_anchor)

@@ -8,6 +8,7 @@ the ends of a step: what the rate changes by in between is noise, and does not a
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Final, NamedTuple
@@ -136,15 +137,15 @@ class MotionSensors:
 
     def add(self, samples: Iterable[MotionSample]) -> None:
         """Add samples; they may come late, and in any order."""
-        new: dict[type[MotionSample], list[tuple[float, ...]]] = {WheelSample: [], GyroSample: []}
+        new = defaultdict[type[MotionSample], list[tuple[float, ...]]](list)
         for sample in samples:
             if isinstance(sample, WheelSample):
                 rates: tuple[float, ...] = sample.velocity_mps, sample.yaw_rate_radps
             else:
                 rates = sample.x_radps, sample.y_radps, sample.z_radps
             new[type(sample)].append((self.seconds(sample.stamp_ns), *rates))
-        for sensor, history in self._histories.items():
-            history.add(new[sensor])
+        for sensor, found in new.items():
+            self._histories[sensor].add(found)
 
     def motion(self, sensor: type[MotionSample], starts_s: Array, ends_s: Array, states: Array) -> Array:
         """Return distance and turn (..., 2) by wheels, or the turns (..., 3) by a gyro without its bias, as reported.

@@ -43,12 +43,8 @@ def sample(image: Image, centres: Array, planes: Array, T: Array, lengths: Vecto
     """
     side, half = templates.shape[1], templates.shape[1] // 2
     cell, part, places = np.empty((0, 0), np.float32), np.empty(4, np.float32), np.empty((2, side * side), np.float32)
-    x, y, by_x, by_y = (
-        places[0],
-        places[1],
-        np.empty((4, side * side), np.float32),
-        np.empty((4, side * side), np.float32),
-    )
+    x, y, weights = places[0], places[1], np.empty((2, 4, side * side), np.float32)
+    by_x, by_y = weights[0], weights[1]
     nodes, powers = np.empty((2, 3, 3)), np.empty((2, 3, 3))
     columns, rows = powers[0], powers[1]
     for n in range(len(templates)):
@@ -290,10 +286,8 @@ def write_design(template: Floats, design: Floats) -> None:
         above, here, below = template[i], template[i + 1], template[i + 2]
         for j in range(side):
             left, right = 3 * (above[j] + below[j]) + 10 * here[j], 3 * (above[j + 2] + below[j + 2]) + 10 * here[j + 2]
-            up, down = (
-                3 * (above[j] + above[j + 2]) + 10 * above[j + 1],
-                3 * (below[j] + below[j + 2]) + 10 * below[j + 1],
-            )
+            up = 3 * (above[j] + above[j + 2]) + 10 * above[j + 1]
+            down = 3 * (below[j] + below[j + 2]) + 10 * below[j + 1]
             design[0, i, j], design[1, i, j] = (left - right) / 32, (up - down) / 32
             design[2, i, j] = here[j + 1]
     for a in range(3, size):

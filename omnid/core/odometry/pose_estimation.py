@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.stereo import view_kernels
-from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import motion_jacobian, triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -111,14 +111,14 @@ def gauss_newton(
     views: Array,
     T: Array,
     model: StereoModel,
-    noise: Array | None = None,
+    noise: Array | float = 0.0,
     shared: tuple[Array, Array] | None = None,
 ) -> GaussNewtonResult:
     """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, cut off at outliers
     once the motion is near, S the covariance of a view by its corner (sigma_px, and noise (N, 3, 3) [px^2] in addition
-    to it; None: none) and by its landmark (covariance (N, 3, 3)). shared: derivatives (N, 3, K) [px] of the true views
+    to it) and by its landmark (covariance (N, 3, 3)). shared: derivatives (N, 3, K) [px] of the true views
     by an error of K components that all have in common, such as that of a velocity, and its covariance (K, K); it is
     estimated along with the motion. A view without the upper row (NaN) counts by the lower camera alone. It replaces
     eq. (9) of Dang et al. 2012, which measures in 3-D and is biased short.
@@ -129,9 +129,9 @@ def gauss_newton(
     if len(of_error):
         prior[POSE:, POSE:] += np.linalg.inv(of_error)
     # 1. The information of the views, at the start. An upper row that is not known has none.
-    by_landmark = view_jacobian(se3.apply(T, landmarks), model.cylinder, model.baseline_m) @ T[:3, :3]
-    S = by_landmark @ covariance @ np.swapaxes(by_landmark, 1, 2) + model.sigma_px**2 * np.eye(3)
-    S = S if noise is None else S + noise
+    by_motion = motion_jacobian(se3.apply(T, landmarks), model.cylinder, model.baseline_m)
+    by_landmark = by_motion[:, :, :3] @ T[:3, :3]
+    S = by_landmark @ covariance @ np.swapaxes(by_landmark, 1, 2) + model.sigma_px**2 * np.eye(3) + noise
     is_lower_only = np.isnan(views[:, 2])
     S[is_lower_only, 2], S[is_lower_only, :, 2] = 0.0, 0.0
     S[is_lower_only, 2, 2] = 1.0

@@ -39,9 +39,6 @@ class PoseEdges:
     covariance: Array  # (M, 6, 6) positive definite
     is_loop: Flags  # (M,) True: may be wrong
 
-    def __len__(self) -> int:
-        return len(self.pairs)
-
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphResult:
@@ -62,7 +59,7 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
     """
     if fixed is None:
         fixed = np.arange(len(poses)) == 0
-    graph, loop, weights = _Graph(edges, fixed), edges.is_loop, np.ones(len(edges))
+    graph, loop, weights = _Graph(edges, fixed), edges.is_loop, np.ones(len(edges.pairs))
     residual, J = graph.linearised(poses)
     # With this factor the cost is convex for the largest of the squared residuals.
     largest = float((residual[loop] ** 2).sum(axis=1).max(initial=0.0))

@@ -67,12 +67,11 @@ class DriveLandmarks:
 
         Also the landmarks (L, 3) [m] in odom.
         """
-        keyframe, landmark, camera = (np.concatenate([part[i] for part in self._found]) for i in range(3))
+        keyframe, landmark, camera, pixels = map(np.concatenate, zip(*self._found, strict=True))
         count = np.bincount(landmark[camera == 0], minlength=len(self._points))
-        kept = count[landmark] >= MIN_KEYFRAMES
-        used, numbers = np.unique(landmark[kept], return_inverse=True)
-        pixels = np.concatenate([part[3] for part in self._found])
-        return DriveObservations(keyframe[kept], numbers, camera[kept], pixels[kept]), self._points[used]
+        found = DriveObservations(keyframe, landmark, camera, pixels)
+        kept, used = found.only(count[landmark] >= MIN_KEYFRAMES)
+        return kept, self._points[used]
 
     def _follow(self, current: Panoramas, T_odom_rect: Array) -> None:
         """Find the landmarks of the newest keyframe in the next one, in both of its panoramas."""

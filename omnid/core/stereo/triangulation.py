@@ -32,25 +32,22 @@ def view(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
     return np.column_stack([lower, lower[:, 1] + disparity])
 
 
-def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
-    """Return the derivatives (N, 3, 3) [px/m] of the view (column, lower row, upper row) by the point."""
-    return motion_jacobian(points, cylinder, baseline_m)[:, :, :3]
-
-
 def motion_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array:
-    """Return the derivatives (N, 3, 6) of the view by a small motion [t; r] of the point: p + t + r x p."""
+    """Return the derivatives (N, 3, 6) of the view by a small motion [t; r] of the point: p + t + r x p.
+
+    The first three columns are those by the point [px/m].
+    """
     J = np.empty((len(points), 3, 6))
     view_kernels.motion_jacobian(points, cylinder.focal_px, baseline_m, J)
     return J
 
 
 def point_covariance(
-    points: Array, cylinder: Cylinder, baseline_m: float, sigma_px: float, noise: Array | None = None
+    points: Array, cylinder: Cylinder, baseline_m: float, sigma_px: float, noise: Array | float = 0.0
 ) -> Array:
     """Return covariances (N, 3, 3) [m^2] of points triangulated from views of sigma_px in each coordinate.
 
-    noise: covariance (N, 3, 3) [px^2] of the views in addition to it; None: none.
+    noise: covariance (N, 3, 3) [px^2] of the views in addition to it.
     """
-    J = np.linalg.inv(view_jacobian(points, cylinder, baseline_m))
-    of_views = sigma_px**2 * np.eye(3) + (0.0 if noise is None else noise)
-    return np.asarray(J @ of_views @ np.swapaxes(J, -1, -2))
+    J = np.linalg.inv(motion_jacobian(points, cylinder, baseline_m)[:, :, :3])
+    return np.asarray(J @ (sigma_px**2 * np.eye(3) + noise) @ np.swapaxes(J, -1, -2))
