@@ -90,10 +90,11 @@ class AnchorPropagation:
         new_anchors = self._grow_anchors(np.flatnonzero(ambiguous), candidates)
         # 3. All other points are decided by the line to their nearest anchor.
         anchor = self._nearest_anchors(ambiguous & ~new_anchors)
-        rows = candidates.of(anchor != NO_ANCHOR)
+        decided = anchor != NO_ANCHOR
+        rows = candidates.of(decided)
         along = self._line_differences(rows.point, rows.disparity, anchor[rows.point])
         best, margin = rows.best(rows.difference + along, len(sure))
-        self._assign(rows, best, anchor != NO_ANCHOR)
+        self.disparity[decided] = rows.disparity[best[decided]]
         return np.asarray(new_anchors | (margin > CLEAR_MARGIN))
 
     def _central_points(self, points: Indices) -> Indices:
@@ -134,7 +135,7 @@ class AnchorPropagation:
         mean = np.bincount(row, along, len(anchors)) / np.count_nonzero(anchors != NO_ANCHOR, axis=1)
         best, margin = rows.best(rows.difference + mean.astype(np.float32), len(self.disparity))
         decided = margin > 2 * CLEAR_MARGIN
-        self._assign(rows, best, decided)
+        self.disparity[decided] = rows.disparity[best[decided]]
         return np.asarray(decided)
 
     def _anchors_around(self, points: Indices) -> Indices:
@@ -151,29 +152,21 @@ class AnchorPropagation:
         return chosen
 
     def _line_differences(self, point: Indices, disparity: Indices, anchor: Indices, cells: int = 1) -> Array:
-        """Return the line differences (M,) of points at disparities against anchors that are so many cells away."""
+        """Return the mean absolute differences (M,) of grey levels along lines in the lower and the upper panorama.
+
+        The lines lead from points at disparities to anchors that are so many cells away, and are sampled at equal
+        fractions of their lengths.
+        """
         start = np.stack([self._column[point], self._row[point], disparity.astype(np.float32)])
         end = np.stack([self._column[anchor], self._row[anchor], self.disparity[anchor].astype(np.float32)])
-        return line_difference(self._images, start, end, cells * CELL_PX // 4)  # every fourth pixel
-
-    def _assign(self, rows: Candidates, best: Indices, decided: Flags) -> None:
-        self.disparity[decided] = rows.disparity[best[decided]]
-
-
-def line_difference(images: tuple[Image, Image], start: Array, end: Array, samples: int) -> Array:
-    """Return the mean absolute difference (M,) of grey levels along lines in the lower and in the upper panorama.
-
-    start, end: (3, M) column and row in the lower panorama, and disparity: row in the upper one less row in the lower
-    one. The lines are sampled at equal fractions of their lengths.
-    """
-    difference = np.empty(start.shape[1], np.float32)
-    along = (np.arange(samples, dtype=np.float32) + 0.5) / samples
-    for first in range(0, len(difference), CHUNK_LINES):
-        part = slice(first, first + CHUNK_LINES)
-        columns, rows, disparities = start[:, part, None] + along * (end - start)[:, part, None]
-        lower, upper = (
-            cv2.remap(image, columns, at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for image, at in zip(images, (rows, rows + disparities), strict=True)
-        )
-        difference[part] = cv2.reduce(cv2.absdiff(lower, upper), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0]
-    return difference
+        samples, difference = cells * CELL_PX // 4, np.empty(len(point), np.float32)  # every fourth pixel
+        along = (np.arange(samples, dtype=np.float32) + 0.5) / samples
+        for first in range(0, len(difference), CHUNK_LINES):
+            part = slice(first, first + CHUNK_LINES)
+            columns, rows, disparities = start[:, part, None] + along * (end - start)[:, part, None]
+            lower, upper = (
+                cv2.remap(image, columns, at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                for image, at in zip(self._images, (rows, rows + disparities), strict=True)
+            )
+            difference[part] = cv2.reduce(cv2.absdiff(lower, upper), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0]
+        return difference

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from omnid.core.stereo.anchors import AnchorPropagation, Candidates
 from omnid.core.stereo.semiglobal import (
+    LEFT_RIGHT_PX,
     NO_MATCH,
     ColumnShift,
     Costs,
@@ -32,8 +33,6 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
 
 RESPONSE_SCALE = 0.5  # A 3x3 Sobel of 8-bit images reaches 1020; half of that, clipped at 255, is kept in 8 bits.
-# Largest disagreement of the disparities that both panoramas choose; as in OpenCV's samples (disp12MaxDiff).
-LEFT_RIGHT_PX = 1
 # Sobel response that noise of one grey level reaches in one pixel of a hundred; by trial on development seeds.
 EDGE_NOISE = 6.0
 
@@ -90,7 +89,7 @@ class Matcher:
         self._matching, m = matching, matching
         self._search: SemiGlobalSearch | ColumnSearch
         if m.method in ("auto", "semiglobal"):
-            self._search = SemiGlobalSearch(shape, m.disparities, m.window_px, m.max_cost, LEFT_RIGHT_PX)
+            self._search = SemiGlobalSearch(shape, m.disparities, m.window_px, m.max_cost)
         else:
             self._search = ColumnSearch(shape, matching)
 

@@ -22,6 +22,8 @@ Indices = NDArray[np.intp]
 Flags = NDArray[np.bool_]
 
 NO_MATCH: Final = np.uint16(65535)  # cost of a match outside the image; the largest of uint16, so that none chooses it
+# Largest disagreement of the disparities that both panoramas choose; as in OpenCV's samples (disp12MaxDiff).
+LEFT_RIGHT_PX: Final = 1
 MIN_SLOPE: Final = 1.0  # grey levels per pixel of the sum, so that a flat minimum divides by no zero
 BLOCK_PX: Final = 3  # side of StereoSGBM's matching window at the prior's resolution; the least of its range of 3 to 11
 SMALL_STEP_PENALTY: Final = 100  # Penalty of a change of disparity by one, because walls are smooth.
@@ -43,9 +45,7 @@ class ColumnShift(NamedTuple):
 class SemiGlobalSearch:
     """SAD near a semi-global prior; keeps OpenCV's buffers. One thread may use it at a time."""
 
-    def __init__(
-        self, shape: tuple[int, int], disparities: int, window_px: int, max_cost: int, left_right_px: int
-    ) -> None:
+    def __init__(self, shape: tuple[int, int], disparities: int, window_px: int, max_cost: int) -> None:
         self._disparities, self._window_px, self._max_cost = disparities, window_px, max_cost
         self._searched = SUBPIXEL * max(1, -(-disparities // (SCALE * SUBPIXEL)))  # at the prior's resolution
         self._columns, self._rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1]))
@@ -55,7 +55,7 @@ class SemiGlobalSearch:
             blockSize=BLOCK_PX,
             P1=SMALL_STEP_PENALTY,
             P2=LARGE_STEP_PENALTY,
-            disp12MaxDiff=left_right_px,
+            disp12MaxDiff=LEFT_RIGHT_PX,
             preFilterCap=PREFILTER_CAP,
             uniquenessRatio=0,
             mode=cv2.STEREO_SGBM_MODE_SGBM,

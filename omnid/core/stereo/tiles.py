@@ -52,7 +52,6 @@ class TileSums:
     square: Numbers  # of the grey levels
     saturated: Numbers  # pixels
     change: Numbers  # of the grey levels since the panorama before; 0 of the first one
-    is_first: bool
 
 
 def borders(pixels: int, tiles: int) -> NDArray[np.int32]:
@@ -150,8 +149,7 @@ class TileMonitor:
         saturated = np.asarray(cv2.threshold(sample, SATURATED_GREY - 1, 1, cv2.THRESH_BINARY)[1], np.uint8)
         change = np.asarray(cv2.absdiff(sample, sample if before is None else before), np.uint8)
         grey, square = self._tile_sums(sample), self._tile_sums(sample, cv2.REDUCE_SUM2)
-        of_both = self._tile_sums(saturated), self._tile_sums(change)
-        return TileSums(self._pixels, grey, square, *of_both, is_first=before is None)
+        return TileSums(self._pixels, grey, square, self._tile_sums(saturated), self._tile_sums(change))
 
     def _sampled(self, image: Image) -> Image:
         return np.ascontiguousarray(image[:: self._spacing_px, :: self._spacing_px])
@@ -175,7 +173,7 @@ class TileMonitor:
             is_dark = contrast < DARK_CONTRAST * max(noise_grey[side], MEASURED_NOISE_GREY)
             is_dark &= grey < BLACK_GREY
             blind[side] = np.asarray(self._judged & (is_dark | (saturated > SATURATED_SHARE)))
-            dead[side] = self._dead(side, change, contrast, blind[side], noise_grey[side], is_first=found.is_first)
+            dead[side] = self._dead(side, change, contrast, blind[side], noise_grey[side])
         # 2. What one camera does not show that the other one does.
         energy = {side: self._energy(images[side]) for side in SIDES}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
@@ -187,15 +185,11 @@ class TileMonitor:
             return ALL_LIVE
         return TileStates(dead, blind, columns)
 
-    def _dead(
-        self, side: Side, change: Array, contrast: Array, blind: Flags, noise_grey: float, *, is_first: bool
-    ) -> Flags:
+    def _dead(self, side: Side, change: Array, contrast: Array, blind: Flags, noise_grey: float) -> Flags:
         """Return the tiles of a camera that do not change, by the mean change and the contrast (TILE_ROWS, C).
 
-        blind: dark and saturated ones, which have no noise; is_first: there is no image before.
+        blind: dark and saturated ones, which have no noise.
         """
-        if is_first:
-            return np.zeros_like(self._judged)
         # The mean change between two images with independent normal noise of sigma is 2 sigma / sqrt(pi).
         of_noise = 2 * noise_grey / np.sqrt(np.pi)
         least = NOISE_SHARE * of_noise if noise_grey >= MEASURED_NOISE_GREY else 0.0
