@@ -11,8 +11,8 @@ each sensor is consistent in itself. The comparison of all three is not:
    difference, divided by the variance of the residuals, is the evidence (a likelihood ratio). A steady motion has none.
 2. Scale. The motion of the sensor and of the images is summed over the newest 3 m or 10 s, whichever is shorter, at the
    likeliest lag within 0.3 s.
-3. Direction. Wheels roll forwards: if the images show motion to the side while the base drives straight on, the yaw of
-   the rig on the base is not that of T_base_rig.
+3. Direction, by the same sums. Wheels roll forwards: if the images show motion to the side while the base drives
+   straight on, the yaw of the rig on the base is not that of T_base_rig.
 
 A sensor that differs from two others, which agree, is wrong; of two it is unknown which one is. A difference of
 DOUBT_SHARE of its limit is a doubt, the whole limit a fault. After STILL_S at rest everything is forgotten: a person
@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,7 @@ from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 
 Array = NDArray[np.float64]
+Kind = Literal["distance", "turn", "aside"]  # what is compared; no sensor knows a motion to the side
 
 # Window of the sums, and allowed differences: 0.3 s are 0.15 m at 0.5 m/s, the distance that the collision monitor
 # keeps; 10 % of 3 m are twice that.
@@ -128,22 +129,26 @@ class MotionAgreement:
         wheels_by_lag = self._motion.sensors.motion(WheelSample, *lagged, self._motion.values)
         gyro_by_lag = self._motion.sensors.motion(GyroSample, *lagged, self._motion.values)[..., 2]
         spans = starts, ends, ways
-        distance = _finding(spans, ways, wheels_by_lag[..., 0], LEAST_M, is_distance=True)
-        of_wheels = _finding(spans, turns, wheels_by_lag[..., 1], WHEEL_TURN_RAD)
-        of_gyro = _finding(spans, turns, gyro_by_lag, TURN_RAD)
+        distance = _finding(spans, ways, wheels_by_lag[..., 0], LEAST_M, "distance")
+        of_wheels = _finding(spans, turns, wheels_by_lag[..., 1], WHEEL_TURN_RAD, "turn")
+        of_gyro = _finding(spans, turns, gyro_by_lag, TURN_RAD, "turn")
         wheels = max((distance, of_wheels), key=lambda found: (found.differs, found.excess, found.is_late))
         # 2. Which one differs from the others.
         if not wheels.differs and not of_gyro.differs:
             self._late_since_s = None
-            to_side = _sideways(spans, turns, lateral) if distance.is_known else _Finding()
-            return Conflict(IMAGES_ASIDE, to_side.text, to_side.excess >= 1.0) if to_side.differs else AGREE
+            if not distance.is_known:
+                return AGREE
+            is_straight = (np.abs(turns) <= STRAIGHT_RADPM * np.abs(ways)) & (np.abs(lateral) < np.abs(ways))
+            straight = np.where(is_straight, lateral * np.sign(ways), np.nan)
+            aside = _finding(spans, straight, np.zeros((len(LAGS_S), len(ways))), LEAST_M, "aside")
+            return Conflict(IMAGES_ASIDE, aside.text, aside.excess >= 1.0) if aside.differs else AGREE
         if wheels.differs and of_gyro.differs:
             reason, found = IMAGES_DIFFER, max(wheels, of_gyro, key=lambda found: found.excess)
         elif wheels.differs:
             # The gyro knows nothing of distances.
             reason, found = WHEELS_DIFFER if of_wheels.differs and of_gyro.is_known else IMAGES_OR_WHEELS, wheels
         else:
-            between = _finding(spans, gyro_by_lag[_NO_LAG], wheels_by_lag[..., 1], WHEEL_TURN_RAD)
+            between = _finding(spans, gyro_by_lag[_NO_LAG], wheels_by_lag[..., 1], WHEEL_TURN_RAD, "turn")
             is_alone = of_wheels.is_known and between.excess >= of_wheels.excess
             reason, found = GYRO_DIFFERS if is_alone else IMAGES_OR_GYRO, of_gyro
         # 3. Wheels that turn otherwise than both images and gyro are wrong: a weak motor, another radius. The pose is
@@ -172,12 +177,10 @@ class MotionAgreement:
 _NO_LAG: Final = int(np.argmin(np.abs(LAGS_S)))
 
 
-def _finding(
-    spans: tuple[Array, Array, Array], seen: Array, by_lag: Array, least: float, *, is_distance: bool = False
-) -> _Finding:
+def _finding(spans: tuple[Array, Array, Array], seen: Array, by_lag: Array, least: float, kind: Kind) -> _Finding:
     """Compare the motion seen (N,) in steps with that of a sensor at all lags (L, N), both in metres or radians.
 
-    spans: starts, ends [s] and ways [m] of the steps. least: difference of the sums that is a fault.
+    spans: starts, ends [s] and ways [m] of the steps. least: difference of the sums that is a fault. NaN: not known.
     """
     starts, ends, ways = spans
     # 1. Delay; the newest steps have no samples of later times yet.
@@ -192,22 +195,24 @@ def _finding(
     # 2. Scale: both sums over the newest steps, at the likeliest of the allowed lags.
     newest = np.flatnonzero(known)[::-1]
     moved, seen, times_s = by_lag[at_lag][newest], seen[newest], (ends - starts)[newest]
-    path = np.cumsum(np.abs(moved))
-    count = int(np.searchsorted(path if is_distance else np.cumsum(np.abs(ways[newest])), WINDOW_M)) + 1
+    way = np.cumsum(np.abs(ways[newest]))
+    path = way if kind == "aside" else np.cumsum(np.abs(moved))
+    count = int(np.searchsorted(path if kind == "distance" else way, WINDOW_M)) + 1
     length, apart = float(path[:count][-1]), float((moved - seen)[:count].sum())
     difference = Difference(apart, float(times_s[:count].sum()))
     # 3. The limit: a share of the way, and the motion within the lag that is in order.
-    is_whole = count <= len(path) or _is_long(starts, ends) or not is_distance
-    limit = max(SCALE_SHARE * (length if is_whole else WINDOW_M), least)
+    is_whole = count <= len(path) or ends[-1] - starts[0] >= WINDOW_S - LEAST_STEPS * LAG_STEP_S or kind == "turn"
+    limit = max((ASIDE_SHARE if kind == "aside" else SCALE_SHARE) * (length if is_whole else WINDOW_M), least)
     limit += ALLOWED_LAG_S / 3 * float((np.abs(seen) / np.maximum(times_s, LAG_STEP_S / 5)).max())
     excess = abs(apart) / limit
     # 4. Of a distance the newest second alone as well, which may show a doubt sooner.
-    if is_distance:
+    if kind == "distance":
         soon = int(np.searchsorted(ends[-1] - ends[newest], SOON_S))
         lacking = abs(float((moved - seen)[:soon].sum()))
         if excess < 1.0 and lacking > max(SOON_M, SOON_SHARE * float(np.abs(moved[:soon]).sum())):
             return _Finding(True, max(DOUBT_SHARE, excess), f"by {lacking:.2f} m in {SOON_S:.0f} s", difference)
-    shown = f"{abs(apart):.2f} m in {length:.1f} m" if is_distance else f"{math.degrees(abs(apart)):.0f} degrees"
+    angle_deg = math.degrees(math.atan2(abs(apart), length) if kind == "aside" else abs(apart))
+    shown = f"{abs(apart):.2f} m in {length:.1f} m" if kind == "distance" else f"{angle_deg:.0f} degrees"
     return _Finding(True, excess, f"by {shown}", difference)
 
 
@@ -224,25 +229,6 @@ def _lag(by_lag: Array, seen: Array) -> tuple[int, int, bool]:
     return best, near, bool(is_strong and best not in allowed)
 
 
-def _sideways(spans: tuple[Array, Array, Array], turns: Array, lateral: Array) -> _Finding:
-    """Return the motion to the side (N,) in the straight part of the newest WINDOW_M."""
-    starts, ends, ways = spans
-    straight = np.flatnonzero((np.abs(turns) <= STRAIGHT_RADPM * np.abs(ways)) & (np.abs(lateral) < np.abs(ways)))[::-1]
-    path_m = np.cumsum(np.abs(ways[straight]))
-    count = min(len(path_m), int(np.searchsorted(path_m, WINDOW_M)) + 1)
-    if count < LEAST_STEPS:
-        return _Finding()
-    moved_m, length_m = abs(float((lateral * np.sign(ways))[straight][:count].sum())), float(path_m[count - 1])
-    is_whole = count < len(path_m) or _is_long(starts, ends)
-    limit_m = max(ASIDE_SHARE * (length_m if is_whole else WINDOW_M), LEAST_M)
-    return _Finding(True, moved_m / limit_m, f"by {math.degrees(math.atan2(moved_m, length_m)):.0f} degrees")
-
-
-def _is_long(starts: Array, ends: Array) -> bool:
-    """True if steps fill the window of time."""
-    return bool(ends[-1] - starts[0] >= WINDOW_S - LEAST_STEPS * LAG_STEP_S)
-
-
 class Contradiction:
     """Covariance of the pose by the difference between the images and the wheels or gyro that contradict them.
 
@@ -251,7 +237,7 @@ class Contradiction:
     """
 
     def __init__(self) -> None:
-        self._faults, self._doubt = np.zeros(6), np.zeros(6)  # displacements [t; r] as twists in odom
+        self._faults = np.zeros(6)  # displacement [t; r] as a twist in odom
         self._fault_s = -math.inf  # time of the last fault
 
     def add(self, conflict: Conflict, T_odom_base: Array, time_s: float) -> Array:
@@ -261,8 +247,8 @@ class Contradiction:
         seconds, to_odom = time_s - self._fault_s, se3.adjoint(T_odom_base)
         new = to_odom @ [conflict.distance.part(seconds), 0.0, 0.0, 0.0, 0.0, conflict.turn.part(seconds)]
         is_fault = conflict.contradicts_images and conflict.is_fault
-        self._doubt = new if conflict.contradicts_images and not is_fault else np.zeros(6)
+        whole = self._faults + new if conflict.contradicts_images else self._faults
         if is_fault:
-            self._faults, self._fault_s = self._faults + new, time_s
-        displacement = se3.adjoint(se3.inverse(T_odom_base)) @ (self._faults + self._doubt)
+            self._faults, self._fault_s = whole, time_s
+        displacement = se3.adjoint(se3.inverse(T_odom_base)) @ whole
         return np.outer(displacement, displacement)
