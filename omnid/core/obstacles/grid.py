@@ -11,8 +11,7 @@ hanging, or a step), and whether they are known.
 3. Hidden Markov prediction: an obstacle comes into a cell with a small probability in each pair, so L has a lower
    bound; and unobserved cells may be entered from unknown ones, at 1.6 m/s by a person, 25 cm wide.
 4. Too near to be seen: known by what is seen past a cell. What hides the nearest floor in view may be anywhere
-   before it, unless an obstacle is known there. It has left when that floor is seen again; what is low hid none, and
-   stays.
+   before it, unless an obstacle is known there. It has left when a base at rest sees that floor again.
 5. Arrivals: the first obstacle of a direction, where the floor was free a short while ago.
 """
 
@@ -53,6 +52,7 @@ class GridParameters:
     same_place: float = 0.9  # rho: correlation of the errors of pairs from one place, 0 after the way of a cell
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
+    rest_m: float = 0.01  # by which a base at rest seems to move
     outline_cells: int = 2  # around what has left, by which rays are wider than its outline
     strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
@@ -168,12 +168,12 @@ class ObstacleGrid:
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of an obstacle; evidence of the pair before; mean of what single pairs show; whether a cell is known;
         # views past it; whether the last pair saw floor behind it; time [s] since it was free; views in which
-        # it hid the nearest floor, less those past it.
+        # it hid the nearest floor from this place, less those past it.
         self.odds, self._before, self._surface, self._known, *others = self._layers
         self._past_views, self._was_past, self._free_s, self._hiding = others
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
-        self._carry = 0.0
+        self._carry, self._rest_m = 0.0, np.full(2, np.inf)
 
     def update(self, stamp_ns: int, pose: Array, belief: RayBelief) -> GridScan:
         """Add a pair, whose base has the pose (3,) in odom; return what is known."""
@@ -214,7 +214,7 @@ class ObstacleGrid:
         if is_first:
             self._assume_free(columns, hides, belief)
             self._assume_walls(yaw, hides, belief)
-        self._release(hidden, past, in_view, np.float32(1 - rho))
+        self._release(place_m, hidden, past, np.float32(1 - rho))
         # 4. What hides the nearest floor in view, behind which floor was seen before, may be anywhere before it. What
         #    hides it from the start may be where it was. And somebody may come where no pair shows the floor.
         rays, things = _along(self._eye, yaw), self._things()
@@ -287,15 +287,17 @@ class ObstacleGrid:
         possible.flat[before] = candidates.take(before)
         return _without_specks(possible)
 
-    def _release(self, hidden: Flags, past: Flags, in_view: Flags, views: np.float32) -> None:
-        """Release cells (SIDE, SIDE) too near to be seen whose thing hid the nearest floor in view, which is seen now.
+    def _release(self, place_m: Array, hidden: Flags, past: Flags, views: np.float32) -> None:
+        """Release cells (SIDE, SIDE) too near to be seen whose obstacle hid the nearest floor in view from the place
+        (2,) of a base at rest, and does so no longer.
 
-        So a person or a trolley has left, with the cells around its outline. What is low hides no floor, and stays.
-        views: of a pair.
+        So a person or a trolley has left, with the cells around its outline. What is low hides that floor from the same
+        place, or not. views: of a pair.
         """
         p, hiding = self._p, self._hiding
-        hiding += np.where(hidden, views, np.where(past, -views, 0))
-        hiding[in_view] = 0
+        if math.dist(place_m, self._rest_m) > p.rest_m:
+            self._rest_m, hiding[:] = place_m, 0
+        hiding += np.where(hidden, 2 * views, np.where(past, -views, 0))
         has_left = past & (hiding < p.views) & (hiding + views >= p.views)
         if has_left.any():
             around = cv2.dilate(has_left.view(np.uint8), SQUARE, iterations=p.outline_cells) > 0
