@@ -64,6 +64,10 @@ def bytes_of(path: str | PathLike[str], limit: int) -> bytes:
 
 def table_of(data: bytes) -> dict[str, Any]:
     """Return the table of TOML bytes; raise ValueError for bytes that are no TOML in UTF-8."""
+    # The time of tomllib grows with the square of the parts of a key, and keys have one line.
+    dots = [line.count(b".") for line in data.splitlines()]
+    if len(dots) > 10_000 or max(dots, default=0) > 256:
+        raise ValueError(f"expected at most 10000 lines of 256 dots, found {len(dots)} of up to {max(dots)} dots")
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:

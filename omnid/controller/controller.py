@@ -17,7 +17,7 @@ from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerS
 from omnid.core.control.heading_controller import STOP, Twist
 from omnid.core.control.motion_monitor import Motion
 from omnid.core.control.safety_rules import AWAITED, BUMPER, CLIFF, FAILED, STOPPED
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 
 
 class Controller:
@@ -46,7 +46,7 @@ class Controller:
         """
         self._driver, self._report, self._clock_ns = driver, report, clock_ns
         self._limited = limited or (lambda command: (command.velocity_mps, command.yaw_rate_radps))
-        self._period_ns = round(period_s * 1e9)
+        self._period_ns = round(period_s * NS_PER_S)
         self._law = ControlLaw(settings, self._clock_ns())
         self._last_ns = 0  # the last tick
         self.due_ns = 0  # when the next one is due (CLOCK_MONOTONIC); 0: at once

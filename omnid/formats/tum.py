@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from drivers.logs.log import LATEST_NS
+from drivers.logs.log import LATEST_NS, MAX_RECORD_BYTES
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ def read_tum(path: str | Path) -> Trajectory:
     found, line = list[tuple[int, int, list[float]]](), 0
     try:
         with Path(path).open(encoding="utf-8-sig", errors="replace", newline="\n") as file:
-            for line, content in enumerate(file, start=1):
+            for line, content in enumerate(iter(lambda: file.readline(MAX_RECORD_BYTES), ""), start=1):
                 if words := content.partition("#")[0].split():
                     stamp_ns, pose = _row(words)
                     found.append((stamp_ns, line, pose))

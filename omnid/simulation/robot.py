@@ -34,7 +34,7 @@ from omnid.controller.ipc import LONGEST_RAMP_S, TickReport
 from omnid.core.control.arming import ArmRequest, ContactState, TimedSetpoint
 from omnid.core.control.collision_monitor import ControllerScan
 from omnid.core.control.control_law import ControlInput, ControllerPose
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.simulation.rendering.ray_caster import Floats, Sensor, render_grey
 from omnid.simulation.world import Walkers, World, clearance_m
 
@@ -176,7 +176,7 @@ class Vehicle:
             clock_ns=lambda: self.now_ns,
             limited=drive.limited,
         )
-        self._period_ns = round(1e9 / config.motor.rate_hz)
+        self._period_ns = round(NS_PER_S / config.motor.rate_hz)
         self._posted: SimpleQueue[tuple[int, int, Message]] = SimpleQueue()  # when it is due [ns], number
         self._waiting: list[tuple[int, int, Message]] = []
         self._numbers, self._arrived_ns = count(), 0
@@ -206,14 +206,14 @@ class Vehicle:
         time of arrival arrives when `advance` is called next.
         """
         if isinstance(message, ControllerPose | ControllerScan):
-            due_ns = message.stamp_ns + round(self.robot.pose_delay_s * 1e9)
+            due_ns = message.stamp_ns + round(self.robot.pose_delay_s * NS_PER_S)
         self._posted.put((due_ns, next(self._numbers), message))
 
     def pairs(self, wait: Callable[[], object]) -> Iterator[Exposure]:
         """Yield pair after pair. wait: returns when the messages that follow from the pairs before have been posted."""
         for seq in count():
             # 1. The body moves by what the controller knows; the images show it there.
-            stamp_ns = self._start_ns + round(seq * 1e9 / self.robot.rate_hz)
+            stamp_ns = self._start_ns + round(seq * NS_PER_S / self.robot.rate_hz)
             self.advance(stamp_ns, includes_end=False)
             frames = self.images(seq, stamp_ns)
             # 2. What has been answered meanwhile takes effect with the tick of now.
@@ -237,7 +237,7 @@ class Vehicle:
         while (due_ns := min(self._tick_ns, self._gyro_ns)) < until_ns + includes_end:
             self._elapse(due_ns)
             if due_ns == self._gyro_ns:
-                self._gyro_ns += round(1e9 / self.robot.gyro_hz)
+                self._gyro_ns += round(NS_PER_S / self.robot.gyro_hz)
             if due_ns == self._tick_ns:
                 while self._waiting and self._waiting[0][0] <= self.now_ns:
                     self._deliver(heapq.heappop(self._waiting)[2])

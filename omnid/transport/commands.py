@@ -32,7 +32,7 @@ from omnid.controller.link import DriveLink
 from omnid.core.control.arming import OLDER_THAN_STOP, OPERATOR, PLANNER, ArmRequest, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import BUMPER, CLIFF
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.core.navigation import requests
 from omnid.core.navigation.path import FARTHEST_M
 from omnid.engine.graph import Stream
@@ -79,7 +79,7 @@ class Freshness:
 
     def __init__(self, stale_s: float, clock: RobotClock | None = None, simulated: RobotClock | None = None) -> None:
         """clock: that of the computer. simulated: that of a simulated robot, of which a stamp may be as well."""
-        self.stale_ns = round(stale_s * 1e9)
+        self.stale_ns = round(stale_s * NS_PER_S)
         self.clock, self._simulated = clock or RobotClock(), simulated
         self._zero_ns = secrets.randbits(61)  # an echo of an earlier run is none of this one
 

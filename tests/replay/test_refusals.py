@@ -24,6 +24,7 @@ TABLE = (
     # Rigs.
     ("replay {log}", "omnid calibrate import"),
     ("replay {log} --rig {folder}/broken.toml", "broken.toml"),
+    ("replay {log} --rig {folder}/deep.toml", "expected at most 10000 lines of 256 dots, found 1 of up to 100000 dots"),
     ("replay {log} --rig {folder}/bare.toml", "images are 256x256"),
     ("replay {log} --rig {folder}/narrow.toml", "share no view between -50.0 and 40.0 degrees of elevation"),
     ("replay {log} --rig {folder}/huge.toml", "at most 67108864 in all"),
@@ -62,6 +63,7 @@ def folder(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     other = rig.replace("size = [256, 256]", "size = [640, 640]")
     rigs = {
         "broken": "schema = 1\n[lower]\nmodel = 7\n",
+        "deep": f"{'a.' * 100_000}b = 1",
         "bare": "\n\n".join(table for table in other.split("\n\n") if ".mask]" not in table) + "\n",
         "narrow": re.sub(r"fu = -?", "fu = -9000", rig),
         "huge": re.sub(r"size = .*", "size = [32767, 32767]", rig),
