@@ -236,7 +236,7 @@ class MotionFilter:
         F[POSE, VELOCITY] = dt_s * np.eye(6)
         moved = F @ self._filter.P @ F.T
         self.since_found_s += dt_s
-        self._grow((moved - self._filter.P)[POSE, POSE])
+        self.grown_m2 += float(np.diag(moved - self._filter.P)[POSE][:3].max())
         self._filter.P = bounded(moved, POSE)
         if not is_measured:
             self._filter.x[:12] *= math.exp(-dt_s / SLOWING_S)
@@ -244,11 +244,8 @@ class MotionFilter:
     def distrust(self, covariance: Array) -> None:
         """Add a covariance (6, 6) to that of the pose, for a motion that nothing has measured; nor is the velocity."""
         self._filter.P[POSE, POSE] += covariance
-        self._grow(covariance)
-        self._forget_velocity()
-
-    def _grow(self, covariance: Array) -> None:
         self.grown_m2 += float(np.diag(covariance)[:3].max())
+        self._forget_velocity()
 
     def _forget_velocity(self) -> None:
         if not self._is_unknown:

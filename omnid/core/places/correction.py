@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap, relative_covariance
+from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.pose_graph import PoseEdges, optimise
 
 Array = NDArray[np.float64]
@@ -91,9 +91,8 @@ class MapCorrection:
         if self._anchor is None:
             return covariance
         anchor, of_map = self._anchor
-        T_anchor_rect = se3.inverse(anchor.T_odom_rect) @ T_odom_rect
+        T_anchor_rect, since = anchor.relative_pose(T_odom_rect, covariance)
         A = se3.adjoint(se3.inverse(T_anchor_rect))
-        since = relative_covariance(T_anchor_rect, anchor.covariance, covariance)
         return np.asarray(A @ of_map @ A.T + self.factor * since)
 
     def _drift_factor(self, links: list[Link]) -> float:

@@ -20,15 +20,7 @@ from omnid.core.nanoseconds import NS_PER_S, STAMP_JITTER_NS
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.features import Thumbnail, describe, thumbnail
-from omnid.core.places.place_map import (
-    NO_KEYFRAME,
-    Link,
-    PlaceFeatures,
-    PlaceKeyframe,
-    PlaceLimits,
-    PlaceMap,
-    relative_covariance,
-)
+from omnid.core.places.place_map import NO_KEYFRAME, Link, PlaceFeatures, PlaceKeyframe, PlaceLimits, PlaceMap
 from omnid.core.places.recognition import (
     FAR,
     GATE_M,
@@ -309,10 +301,8 @@ class MapLocaliser:
     def _close_loop(self, frame: OdometryFrame, found: Recognition, newest: PlaceKeyframe) -> None:
         """Link a recognised place, once several frames agree, and correct the map."""
         # 1. The recognition, with those before it that agree.
-        T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
-        since = relative_covariance(T_keyframe_rect, newest.covariance, frame.covariance)
         link = Link(found.id, -1, found.T_place_rect, found.covariance, found.inliers)
-        link = link.then(Link(newest.id, -1, T_keyframe_rect, since).reversed())
+        link = link.then(Link(newest.id, -1, *newest.relative_pose(frame.T_odom_rect, frame.covariance)).reversed())
         hypothesis, poses = Hypothesis(found, frame.T_odom_rect, link), self.places.poses
         consistent = consistent_hypotheses(self._hypotheses, hypothesis, poses)
         self._hypotheses.append(hypothesis)

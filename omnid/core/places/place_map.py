@@ -69,16 +69,17 @@ class PlaceKeyframe:
     free_m: NDArray[np.float16]  # (360,) in the same order, up to which floor was seen, see FreeRanges
     features: PlaceFeatures
 
+    def relative_pose(self, T_odom_rect: Array, covariance: Array) -> tuple[Array, Array]:
+        """Return T_keyframe_rect (4, 4) of a later pose of odometry with its covariance, and its own covariance (6, 6).
 
-def relative_covariance(T_a_b: Array, of_a: Array, of_b: Array) -> Array:
-    """Return the covariance (..., 6, 6) of T_a_b for poses whose covariances grow along the path from a to b.
-
-    What b has beyond a; its negative part, where the estimate of b became better than that of a, is left out.
-    """
-    A = se3.adjoint(se3.inverse(T_a_b))
-    grown = of_b - A @ of_a @ np.swapaxes(A, -1, -2)
-    values, vectors = np.linalg.eigh((grown + np.swapaxes(grown, -1, -2)) / 2)
-    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+        Covariances grow along the path: it is what the later pose has beyond the keyframe. Its negative part, where the
+        estimate of the later one became better, is left out.
+        """
+        T_keyframe_rect = se3.inverse(self.T_odom_rect) @ T_odom_rect
+        A = se3.adjoint(se3.inverse(T_keyframe_rect))
+        grown = covariance - A @ self.covariance @ A.T
+        values, vectors = np.linalg.eigh((grown + grown.T) / 2)
+        return T_keyframe_rect, np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,8 +95,7 @@ class Link:
     @staticmethod
     def by_odometry(a: PlaceKeyframe, b: PlaceKeyframe) -> Link:
         """Return the edge between two keyframes as odometry measured it."""
-        T_a_b = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
-        return Link(a.id, b.id, T_a_b, relative_covariance(T_a_b, a.covariance, b.covariance))
+        return Link(a.id, b.id, *a.relative_pose(b.T_odom_rect, b.covariance))
 
     @property
     def is_loop(self) -> bool:
