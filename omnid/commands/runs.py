@@ -22,8 +22,6 @@ from omnid.commands import options
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
 from omnid.diagnostics.status import show_progress, summary_entries, timing_table
-from omnid.engine.graph import no_op
-from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
@@ -31,7 +29,6 @@ from omnid.recordings.evaluation import evaluate
 from omnid.runs.live import ConnectedRobot, record_frames, run_live
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.wiring import attached_rig
-from omnid.simulation.demonstration import demonstrate
 from omnid.simulation.paced_robot import PacedRobot
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world import load_world
@@ -202,21 +199,15 @@ def replay_and_print(log: Path, config: Config, asked: ReplayOptions, args: argp
 
 @options.command(options.VERBOSE, options.QUIET, options.SETTINGS)
 def demo(args: argparse.Namespace) -> int:
-    """Replay a sample in real time, with files and bus, and print its errors; or drive.
+    """Replay a sample in real time, with files and bus, and print its errors.
 
     --output FOLDER=omnid-demo  folder of the output files
-    --drive                     a simulated robot is taught a route of 6 m and repeats it; takes a minute or two, and
-        writes drive.png with both true paths
-    --seed N=1 0..              with --drive: of the world and its noise
 
     examples:
       demo
-      demo --drive
       demo --output /tmp/demo --quiet
     """
     args.output.mkdir(parents=True, exist_ok=True)
-    if args.drive:
-        return _drive(args)
     tum = args.output / "trajectory.tum"
     asked = ReplayOptions(
         tum=tum,
@@ -234,19 +225,6 @@ def demo(args: argparse.Namespace) -> int:
         if code == 0:
             print(f"\nagainst the truth:\n{evaluate(read_tum(tum), read_tum(truth))}")
     return code
-
-
-def _drive(args: argparse.Namespace) -> int:
-    """Drive a simulated robot; print the errors against the truth, and draw both paths."""
-    place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
-    config = options.settings_of(args, {"places.map": place_map, "navigation.routes": routes})
-    place_map.unlink(missing_ok=True)  # of an earlier demonstration
-    prepare_kernels()  # which says so where it takes long
-    show = no_op if args.quiet else partial(print, flush=True)
-    show("a simulated robot is taught an oval and repeats it, which takes a minute or two")
-    is_reached, lines = demonstrate(image, config, args.seed, show)
-    print(*lines, f"written   {image}, {place_map}", sep="\n")
-    return int(not is_reached)
 
 
 @options.command(options.SETTINGS)

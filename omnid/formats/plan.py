@@ -34,7 +34,6 @@ class Lines:
     parts: Sequence[Array]  # each (N, 2) m
     colour: str
     width_pt: float
-    name: str = ""  # in the legend
 
 
 def drawn_heights(height_m: float) -> tuple[float, float]:
@@ -110,15 +109,13 @@ def draw_plan(xy_m: Array, confidence: NDArray[np.float32], lines: Sequence[Line
     axes.imshow(grey, "gray", vmin=0, vmax=255, interpolation="nearest", origin="lower", extent=extent, aspect="auto")
     # 3. The lines, and both ends of the path.
     for one in lines:
-        for number, part in enumerate(one.parts):
-            axes.plot(*part.T, color=one.colour, linewidth=one.width_pt, label="" if number else one.name)
+        for part in one.parts:
+            axes.plot(*part.T, color=one.colour, linewidth=one.width_pt)
     for point, name, inside, above_pt in ((path[-1:], "end", "black", -18), (path[:1], "start", "white", 10)):
         for place in point:
             axes.annotate(name, place, (0, above_pt), textcoords="offset points", ha="center")
         axes.plot(*point.T, "o", markersize=9, markeredgecolor="black", markerfacecolor=inside)
     axes.set(xlim=(low_m[0], high_m[0]), ylim=(low_m[1], high_m[1]), xlabel="x forward [m]", ylabel="y left [m]")
-    if any(one.name for one in lines):
-        figure.legend(loc="upper center", ncols=len(lines), frameon=False)
     return axes
 
 

@@ -162,11 +162,6 @@ def distances_m(segments: Array, places: Array) -> Array:
     return np.asarray(distances.min(axis=1, initial=np.inf))
 
 
-def cross_track_m(first: Array, second: Array) -> Array:
-    """Return the distances (M,) [m] of positions (M, 2) from the line through others (N, 2)."""
-    return distances_m(np.stack([first, np.vstack([first[1:], first[-1:]])], axis=1), second)
-
-
 def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) -> float:
     """Return the distance [m] from a disc, the robot's outline, to the nearest of segments; 0 or less: contact."""
     return float(distances_m(segments, np.array([place]))[0]) - radius_m

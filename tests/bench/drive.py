@@ -32,7 +32,7 @@ from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.rendering.surfaces import poster
 from omnid.simulation.robot import START_NS, make_robot
-from omnid.simulation.world import Walker, World, cross_track_m, load_world
+from omnid.simulation.world import Walker, World, distances_m, load_world
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation.disturbed import Fault, Slip, disturbed, least_clearance_m, simulate
@@ -118,7 +118,7 @@ def row(case: Case, driven: SimulatedRun) -> list[Cell]:
         state,
         100 * math.dist(end[:2, 3], goal[:2]),
         abs(error_deg),
-        100 * cross_track_m(legs, driven.truth_in_odom[:, :2, 3]).max(),
+        100 * distances_m(np.stack([legs[:-1], legs[1:]], axis=1), driven.truth_in_odom[:, :2, 3]).max(),
         float(np.linalg.norm(moved, axis=1).sum()),
         len(driven.contacts),
         least_clearance_m(driven),
@@ -269,7 +269,7 @@ def route_row(taught: Array, driven: SimulatedRun) -> list[Cell]:
     """Return the figures of a drive against the true positions (N, 2) of the lesson."""
     path = np.array([tick.pose[:2] for tick in driven.ticks])
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    off_cm = 100 * cross_track_m(taught, path)[way_m > SETTLED_M]
+    off_cm = 100 * distances_m(np.stack([taught[:-1], taught[1:]], axis=1), path)[way_m > SETTLED_M]
     p95, most = (np.percentile(off_cm, 95), off_cm.max()) if len(off_cm) else (None, None)
     end_cm = 100 * math.dist(path[-1], taught[-1])
     stops = dict.fromkeys(line for _, line in driven.lines if line.startswith("the wheels stop"))
