@@ -18,14 +18,13 @@ from omnid.core.control.motion_monitor import AGREE, Conflict
 from omnid.core.frames import BodyMotion
 from omnid.core.mapping.scan_grid import Grid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.core.navigation.requests import TaughtRoute
+from omnid.core.navigation.requests import NavigationState, TaughtRoute
 from omnid.core.obstacles.grid import FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.types.panorama import Panoramas
-from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]

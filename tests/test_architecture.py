@@ -24,7 +24,7 @@ LAYERS = ("calib", "drivers", "omnid")
 TIERS: Mapping[str, str] = {
     "geometry": "calib",
     "hardware and logs": "drivers",
-    "settings and states": "omnid.errors omnid.version omnid.navigation_state omnid.tracking_state "
+    "settings and states": "omnid.errors omnid.version omnid.tracking_state "
     "omnid.settings omnid.sample omnid.plain_text",
     "numerics": "omnid.core",
     "threads, queues, the controller process": "omnid.engine omnid.controller",

@@ -13,14 +13,13 @@ from typing import Final
 
 from omnid.client import Answer, Driver, NavigationReport, Robot
 from omnid.commands.options import ROBOT, SETTINGS, command, settings_of
-from omnid.core.navigation.requests import route_name
+from omnid.core.navigation.requests import NavigationState, route_name
 from omnid.engine.logging_setup import HANDLER
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.monitor import robot_state
 from omnid.monitor.teleop import teleoperate
-from omnid.navigation_state import NavigationState
 from omnid.plain_text import utc
 
 NAME: Final = "name NAME  letters, digits, '-' and '_'"
@@ -142,19 +141,17 @@ def teach(args: argparse.Namespace) -> int:
 
 @command(NAME, ROBOT, SETTINGS)
 def repeat(args: argparse.Namespace) -> int:
-    """Repeat a route, from where the robot is on it; exit code 1: its end was not reached, 2: it refuses.
+    """Repeat a route, from where the robot is on it, within 1.5 m; exit code 1: its end was not reached, 2: it refuses.
 
-    --reverse               from its end to its start
-    --loops N=1 1..10000    a closed route is driven in rounds, another there and back, N times in all
-    --from here|start=here  here: from where the robot is on the route, anywhere within 1.5 m of it; start: the whole
-        route, refused elsewhere
+    --reverse             from its end to its start
+    --loops N=1 1..10000  a closed route is driven in rounds, another there and back, N times in all
 
     examples:
       route repeat morning
       route repeat morning --reverse --loops 5
     """
     words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
-    text = " ".join([*words, f"loops={args.loops}", f"from={vars(args)['from']}"])
+    text = " ".join([*words, f"loops={args.loops}"])
     return _drive(args, lambda driver: driver.route(text))
 
 

@@ -25,13 +25,12 @@ from omnid.engine.graph import Histogram, StageStats
 from omnid.engine.logging_setup import HANDLER
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import OdometryUpdate
-from omnid.navigation_state import with_reason
 from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.commands import CommandReceiver
-from omnid.transport.status_names import NOTABLE_SHARE, TIMEOUT_S, Key, Stats, by_reason, entry
+from omnid.transport.status_names import NOTABLE_SHARE, TIMEOUT_S, Key, Stats, by_reason, entry, with_reason
 
 
 class RunStatistics:

@@ -17,9 +17,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from omnid.client import ANSWER_S, HERE, NavigationReport, Robot
+from omnid.core.navigation.requests import NavigationState
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
-from omnid.navigation_state import NavigationState
 from omnid.plain_text import MAX_ENTRIES, plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
 from omnid.transport.session import PERIOD_S, BusConfig

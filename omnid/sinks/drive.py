@@ -15,11 +15,12 @@ from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerState
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import AWAITED
+from omnid.core.navigation.requests import NavigationState
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate
-from omnid.navigation_state import NavigationState, with_reason
 from omnid.stages.obstacles import controller_scan
 from omnid.tracking_state import TrackingState
+from omnid.transport.status_names import with_reason
 from omnid.transport.topics import Answer, Answers
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender, which keeps other programs off its source

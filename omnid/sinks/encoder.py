@@ -17,14 +17,14 @@ from drivers.motor import VelocityCommand
 from omnid.core.frames import carried, in_outer_axes
 from omnid.core.mapping.voxel_map import ThinnedPath
 from omnid.core.nanoseconds import NS_PER_S
+from omnid.core.navigation.requests import NavigationState
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.navigation_state import NavigationState, with_reason
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
 from omnid.transport.bus import Bus
 from omnid.transport.codec import CLOCK_SCHEMA, Diagnostics, DiagnosticStatus, PoseAttachment, encoded
 from omnid.transport.sensor_codec import gyro_cdr, image_cdr, wheel_cdr
-from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry
+from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry, with_reason
 from omnid.transport.topics import CLOCK, MAP_POSE, PANORAMA, SCAN
 
 Outgoing: TypeAlias = (

@@ -25,7 +25,7 @@ from omnid.core.navigation.requests import (
     RouteAction,
     RouteRequest,
     TaughtRoute,
-    may_begin_motion,
+    is_end,
 )
 from omnid.core.navigation.route import ENTRY_M, KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
@@ -172,7 +172,7 @@ class NavigationStage:
     def _execute(self, command: NavigationCommand) -> None:
         """Execute a request. Raise OmnidError with the reason to refuse it."""
         request, navigator = command.request, self._navigator
-        if may_begin_motion(request) and command.stop_count < self._wheels.stop_count:
+        if not is_end(request) and command.stop_count < self._wheels.stop_count:
             raise OmnidError("a stop or a fault has come since: ask again")
         match request:
             case NavigationVerb.CANCEL:
@@ -227,14 +227,8 @@ class NavigationStage:
                 f"the route {request.name} was taught in the map {route.map_name} as it was then: start with "
                 "that map (`omnid run --map`), or teach it again"
             )
-        return repeated_paths(
-            route,
-            keyframes,
-            self._pose_in(NavigationFrame.MAP),
-            loops=request.loops,
-            reverse=request.reverse,
-            from_start=request.from_start,
-        )
+        pose = self._pose_in(NavigationFrame.MAP)
+        return repeated_paths(route, keyframes, pose, loops=request.loops, reverse=request.reverse)
 
     def _teach(self, request: RouteRequest) -> None:
         """Begin to record: where the robot is localised, or in a map that begins with this run."""

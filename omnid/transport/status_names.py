@@ -19,7 +19,6 @@ import msgspec
 
 from omnid.core.control.safety_rules import ASKED
 from omnid.errors import OmnidError
-from omnid.navigation_state import with_reason
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, decode_diagnostics
 
@@ -153,9 +152,14 @@ def tracking_state(message: str, values: Mapping[str, str]) -> TrackingState | N
     return TrackingState(text) if text in list(TrackingState) else None
 
 
+def with_reason(state: str, reason: str) -> str:
+    """Return a state with its reason, for people."""
+    return f"{state}: {reason}" if reason else str(state)
+
+
 @dataclass(frozen=True, slots=True)
 class NavigationReport:
-    """State of goals, paths and routes; see omnid.navigation_state for the states.
+    """State of goals, paths and routes; see omnid.core.navigation.requests for the states.
 
     The fields are keys of the entry NAVIGATION, which has none for what is unknown or empty.
     """

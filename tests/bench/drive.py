@@ -27,8 +27,14 @@ from calib import se3
 from calib.models.camera import Array
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
-from omnid.core.navigation.requests import GoalRequest, NavigationFrame, PathRequest, RouteAction, RouteRequest
-from omnid.navigation_state import NavigationState
+from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationFrame,
+    NavigationState,
+    PathRequest,
+    RouteAction,
+    RouteRequest,
+)
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.rendering.surfaces import poster
 from omnid.simulation.robot import START_NS, make_robot

@@ -22,12 +22,11 @@ from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.follower import BRAKE_SHARE, STANDSTILL, Follower, Following
 from omnid.core.navigation.path import BEGIN, SHORTEST_M, DrivePath, PathPlace, goal_path, ways_m
 from omnid.core.navigation.planner import Move, Planner, Way
-from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.requests import NavigationFrame, NavigationState
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import UNKNOWN_M, Situation, refusal_of_map, require_drivable
 from omnid.core.navigation.surroundings import Surroundings
 from omnid.errors import OmnidError
-from omnid.navigation_state import NavigationState
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Requests to the navigation: goals, paths, routes, and words such as cancel. The parsers take any text."""
+"""Requests to the navigation: goals, paths, routes, and words such as cancel; and its state. Parsers take any text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LONGEST_TEXT: Final = 200  # characters of a request; so that messages of any si
 LONGEST_NAME: Final = 64  # Characters of a route's name, so that its file has a valid name: at most 255 bytes.
 _NAME: Final = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 _LOOPS: Final = re.compile(r"loops=([1-9][0-9]{0,4})")
-ROUTE_USAGE: Final = '"teach NAME [replace]", "finish", "repeat NAME [reverse] [loops=N] [from=here|start]" or "stop"'
+ROUTE_USAGE: Final = '"teach NAME [replace]", "finish", "repeat NAME [reverse] [loops=N]" or "stop"'
 
 
 class NavigationFrame(StrEnum):
@@ -26,6 +26,25 @@ class NavigationFrame(StrEnum):
 
     MAP = "map"
     ODOM = "odom"
+
+
+class NavigationState(StrEnum):
+    """State of a goal, a path or a route. The values are the words used on the bus and in logs."""
+
+    IDLE = "idle"  # nothing has been asked for since the start
+    DRIVING = "driving"
+    AVOIDING = "avoiding"  # off the path, around an obstacle
+    BLOCKED = "blocked"  # waits for the way to become free
+    PAUSED = "paused"  # paused by a command, or by a fault that a person must see to; `resume` continues
+    NOT_LOCALISED = "not localised"  # waits for the pose in the map
+    REACHED = "reached"
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+
+    @property
+    def is_end(self) -> bool:
+        """True if nothing is under way: the wheels are given no setpoint."""
+        return self in (self.IDLE, self.REACHED, self.CANCELLED, self.FAILED)
 
 
 class NavigationVerb(StrEnum):
@@ -72,7 +91,6 @@ class RouteRequest:
     name: str = ""
     reverse: bool = False
     loops: int = 1
-    from_start: bool = False  # the whole route; else from where the robot is on it
     replace: bool = False  # teach in the place of a route of that name
 
 
@@ -98,17 +116,10 @@ class NavigationCommand(NamedTuple):
     stop_count: int = 0
 
 
-def may_begin_motion(request: NavigationRequest) -> bool:
-    """True if a request may begin or resume a motion."""
+def is_end(request: NavigationRequest) -> bool:
+    """True if a request ends or pauses what is under way, and begins no motion."""
     if isinstance(request, RouteRequest):
-        return request.action is RouteAction.REPEAT
-    return not stops_motion(request)
-
-
-def stops_motion(request: NavigationRequest) -> bool:
-    """True if a request ends or pauses a motion."""
-    if isinstance(request, RouteRequest):
-        return request.action is RouteAction.STOP
+        return request.action in (RouteAction.FINISH, RouteAction.STOP)
     return request in (NavigationVerb.CANCEL, NavigationVerb.PAUSE)
 
 
@@ -149,9 +160,9 @@ def _repeat_request(name: str, options: list[str], text: str) -> RouteRequest:
         found = _LOOPS.fullmatch(option)
         if found and int(found[1]) <= MAX_LOOPS:
             loops = int(found[1])
-        elif option not in ("reverse", "from=here", "from=start"):
+        elif option != "reverse":
             raise OmnidError(f"{_quoted(text)}: expected {ROUTE_USAGE}, N at most {MAX_LOOPS}")
-    return RouteRequest(RouteAction.REPEAT, name, "reverse" in options, loops, "from=start" in options)
+    return RouteRequest(RouteAction.REPEAT, name, "reverse" in options, loops)
 
 
 def _quoted(text: str) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative, wrapped
 from omnid.core.control.collision_monitor import LEAST_MPS as STANDING_MPS
-from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path, ways_m
+from omnid.core.navigation.path import MAX_LENGTH_M, DrivePath, drive_path, ways_m
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
@@ -29,8 +29,7 @@ SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be 
 CLOSED_M: Final = 1.0  # Most distance between the ends of a route that is driven in rounds.
 ENTRY_M: Final = 1.5  # Most distance of the robot from a route that it repeats.
 ENTRY_M_PER_RAD: Final = 0.5  # Cost of a radian of heading error where several pieces of a route are near.
-BESIDE_M: Final = 0.25  # A robot that is farther from the route drives to a point ahead on it.
-JOIN: Final = 2.5  # Way along the route to that point by lateral distance: at 22 degrees, which is no corner.
+BESIDE_M: Final = 0.25  # A robot that is farther from the route drives to it first.
 
 
 class KeyframePose(NamedTuple):
@@ -166,45 +165,27 @@ class RouteRecorder:
 
 
 def repeated_paths(
-    route: Route,
-    keyframes: Mapping[int, KeyframePose],
-    pose: Array,
-    *,
-    loops: int,
-    reverse: bool,
-    from_start: bool = False,
+    route: Route, keyframes: Mapping[int, KeyframePose], pose: Array, *, loops: int, reverse: bool
 ) -> list[DrivePath]:
     """Return the paths that repeat a route from the nearest point on it to a pose (3,) of the base in the map.
 
-    A closed route is driven in rounds, any other there and back, `loops` times in all. from_start: the whole route.
-    Raise OmnidError where the robot is not near the route or its start, or at the end of a route that is driven once.
+    A closed route is driven in rounds, any other there and back, `loops` times in all. Raise OmnidError where the robot
+    is not near the route, or at the end of a route that is driven once.
     """
     directed = route.reversed() if reverse else route
     poses = directed.in_map(keyframes)
-    # 1. The point of entry: the start, or the nearest point by position and heading.
+    # 1. The point of entry, by position and heading; a robot beside the route drives to it first.
     away_m = np.hypot(*(poses[:, :2] - pose[:2]).T)
-    least_m, first = (away_m[0], 0) if from_start else (away_m.min(), _nearest(directed, poses, pose, away_m))
-    if least_m > ENTRY_M:
-        where = "the start of the route" if from_start else "the route"
-        to = "or begin where it is on the route (from=here)" if from_start else "anywhere on it"
+    if away_m.min() > ENTRY_M:
         raise OmnidError(
-            f"the robot is {least_m:.1f} m away from {where}: drive it there, to within {ENTRY_M:g} m, {to}"
+            f"the robot is {away_m.min():.1f} m away from the route: drive it there, to within {ENTRY_M:g} m, "
+            "anywhere on it"
         )
-    ways = ways_m(poses[first:])
-    if loops == 1 and ways[-1] <= BESIDE_M:
+    first = _nearest(directed, poses, pose, away_m)
+    if loops == 1 and ways_m(poses[first:])[-1] <= BESIDE_M:
         raise OmnidError("the robot is at the end of the route: repeat it in reverse, or drive to its start first")
-    # 2. A robot beside the route joins it farther on, before the next corner.
-    is_beside = away_m[first] > BESIDE_M
-    if is_beside and not from_start:
-        goes_on = (
-            (ways <= JOIN * away_m[first])
-            & (np.abs(wrapped(poses[first:, 2] - poses[first, 2])) < CORNER_RAD)
-            & (directed.speeds[first:] * directed.speeds[first] > 0)
-        )
-        goes_on[0] = True
-        first += int(np.argmin(np.append(goes_on, False))) - 1
-    # 3. The rest of the round, and the others.
-    paths = [_path(directed, poses, first, pose if is_beside else None)]
+    # 2. The rest of the round, and the others.
+    paths = [_path(directed, poses, first, pose if away_m[first] > BESIDE_M else None)]
     if loops > 1:
         rounds = [directed] if route.is_closed else [directed, directed.reversed()]
         whole = [_path(each, each.in_map(keyframes), 0) for each in rounds]

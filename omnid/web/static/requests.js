@@ -106,7 +106,7 @@ export function wireRoutes() {
   const route = (text) => ask("route", text, "route-answer");
   const navigation = (text) => ask("navigation", text, "route-answer");
 
-  button("teach", () => name.reportValidity() && route(`teach ${name.value}`));
+  button("teach", () => name.reportValidity() && route(`teach ${name.value} stamp=${state.server_ms}`));
   button("finish", () => route("finish"));
   button("stop", () => route("stop"));
   button("pause", () => navigation("pause"));

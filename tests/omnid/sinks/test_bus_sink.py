@@ -19,10 +19,10 @@ from omnid.client import Robot
 from omnid.core.control.arming import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.navigation.requests import NavigationState
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
-from omnid.navigation_state import NavigationState
 from omnid.sinks.drive import LiveDrive, navigation_answers
 from omnid.sinks.encoder import CLOUD_POINTS, BusSink, Encoder, Outgoing, PanoramaSink
 from omnid.transport.bus import Bus, BusConfig

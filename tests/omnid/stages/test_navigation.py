@@ -22,6 +22,7 @@ from omnid.core.navigation.requests import (
     NavigationCommand,
     NavigationFrame,
     NavigationRequest,
+    NavigationState,
     NavigationVerb,
     PathRequest,
     RouteAction,
@@ -32,7 +33,6 @@ from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import MapKeyframes, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.navigation_state import NavigationState
 from omnid.runs.files import RouteFiles
 from omnid.sinks.drive import navigation_answers
 from omnid.stages.navigation import NavigationStage

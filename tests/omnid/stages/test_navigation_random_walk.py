@@ -26,6 +26,7 @@ from omnid.core.navigation.requests import (
     NavigationCommand,
     NavigationFrame,
     NavigationRequest,
+    NavigationState,
     NavigationVerb,
     PathRequest,
     RouteAction,
@@ -35,7 +36,6 @@ from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
-from omnid.navigation_state import NavigationState
 from omnid.runs.files import RouteFiles
 from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import Floor, wheel_state

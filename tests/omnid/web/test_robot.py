@@ -249,15 +249,15 @@ def test_requests_that_move_the_robot_are_refused_late_or_without_a_stamp(
 
 
 def test_requests_reach_the_robot_and_its_answer_the_page(rover: Rover, page: RobotPage) -> None:
-    for path, text, moves in (
-        ("/route", "teach dock", False),
+    for path, text, needs_stamp in (
+        ("/route", "teach dock", True),
         ("/route", "finish", False),
         ("/route", "repeat dock", True),
         ("/route", "stop", False),
         ("/navigation", "pause", False),
         ("/navigation", "resume", True),
     ):
-        assert post(page, path, f"{text} stamp={NOW_MS}" if moves else text) == Answer(True, "as asked")
+        assert post(page, path, f"{text} stamp={NOW_MS}" if needs_stamp else text) == Answer(True, "as asked")
         assert rover.texts[-1] == text
     rover.is_granted = False
     refused = post(page, "/route", f"repeat dock stamp={NOW_MS}")

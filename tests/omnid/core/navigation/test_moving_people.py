@@ -13,12 +13,11 @@ from calib.se2_arrays import relative
 from omnid.core.control.collision_monitor import UNKNOWN, ControllerScan, MovingPoint
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path, straight_leg
-from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.requests import NavigationFrame, NavigationState
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
 from omnid.core.navigation.surroundings import LARGEST_SIGMA_M, Surroundings, near_ends
 from omnid.core.obstacles.moving_tracker import Arrivals, MovingObstacle, MovingTracker
-from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase, Floor
 from tests.omnid.core.navigation.test_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes, clearance_m
 

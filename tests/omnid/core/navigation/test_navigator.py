@@ -14,11 +14,10 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.navigator import STOPS, WAITS, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
-from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.requests import NavigationFrame, NavigationState
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, require_drivable
 from omnid.errors import OmnidError
-from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import ARMED, DrivenBase
 

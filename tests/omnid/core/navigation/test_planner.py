@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path, straight_leg
-from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.requests import NavigationFrame, NavigationState
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
 from omnid.core.navigation.surroundings import Surroundings
-from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase, Floor
 
 Array = NDArray[np.float64]

@@ -16,18 +16,18 @@ from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationFrame,
     NavigationRequest,
+    NavigationState,
     NavigationVerb,
     PathRequest,
     RouteAction,
     RouteRequest,
+    is_end,
     navigation_verb,
     route_request,
-    stops_motion,
 )
 from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.errors import OmnidError
-from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 
 Array = NDArray[np.float64]
@@ -134,30 +134,10 @@ def test_a_route_is_repeated_from_anywhere_on_it(start: tuple[float, float, floa
     assert np.percentile(on_way[joined:], 95) < 0.05
 
 
-def test_a_robot_beside_the_route_joins_it_ahead_without_a_corner_and_not_past_one() -> None:
-    straight = np.column_stack([np.arange(0, 6, 0.02), np.zeros(300), np.zeros(300)])
-    corner = straight[-1] + np.column_stack([np.zeros(100), np.arange(0.02, 2.02, 0.02), np.full(100, math.pi / 2)])
-    route = taught(np.vstack([straight, corner]), places := Map(straight))
-    for y_m in (0.8, -0.8):
-        (path,) = repeated_paths(route, places.keyframes, np.array([2.0, y_m, 0.0]), loops=1, reverse=False)
-        assert len(path.legs) == 2, "no corner but that of the route"
-        on_route = path.legs[0].xy[np.abs(path.legs[0].xy[:, 1]) < 0.01]
-        assert on_route[0, 0] == pytest.approx(2.0 + 2.5 * 0.8, abs=0.2)
-    (path,) = repeated_paths(route, places.keyframes, np.array([5.6, 0.9, 0.0]), loops=1, reverse=False)
-    assert any(math.dist(xy, (6.0, 0.0)) < 0.15 for leg in path.legs for xy in leg.xy), "its corner is not cut"
-
-
-def test_the_whole_route_is_driven_from_its_start_only() -> None:
-    poses = way()
-    route, places = taught(poses, Map(poses)), Map(poses)
-    near, far = np.array([0.2, 0.4, 0.0]), poses[200]
-    (path,) = repeated_paths(route, places.keyframes, near, loops=1, reverse=False, from_start=True)
-    assert path.length_m > route.length_m and np.hypot(*(path.legs[0].xy - poses[0, :2]).T).min() < 0.1
-    with pytest.raises(OmnidError, match=r"3\.\d m away from the start of the route: .*from=here"):
-        repeated_paths(route, places.keyframes, far, loops=1, reverse=False, from_start=True)
-    repeated_paths(route, places.keyframes, poses[-10], loops=1, reverse=True, from_start=True)
+def test_a_route_is_not_driven_once_from_its_end() -> None:
+    places = Map(poses := way())
     with pytest.raises(OmnidError, match="the robot is at the end of the route: repeat it in reverse"):
-        repeated_paths(route, places.keyframes, poses[-1], loops=1, reverse=False)
+        repeated_paths(taught(poses, places), places.keyframes, poses[-1], loops=1, reverse=False)
 
 
 def test_a_route_is_driven_there_and_back_and_in_rounds() -> None:
@@ -231,7 +211,7 @@ def test_other_points_are_no_path_and_the_message_says_why(points: ArrayLike, wo
         ("stop", RouteRequest(RouteAction.STOP)),
         ("repeat hall", RouteRequest(RouteAction.REPEAT, "hall")),
         ("  repeat  hall-2 reverse  loops=12 ", RouteRequest(RouteAction.REPEAT, "hall-2", True, 12)),
-        ("repeat hall from=start loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2, True)),
+        ("repeat hall loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2)),
     ],
 )
 def test_texts_are_parsed_as_requests_about_routes(text: str, expected: RouteRequest) -> None:
@@ -243,7 +223,8 @@ def test_texts_are_parsed_as_requests_about_routes(text: str, expected: RouteReq
     [
         "",
         "teach",
-        "repeat a from=here from=start",
+        "repeat a from=start",
+        "repeat a loops=2 loops=3",
         "teach ../etc",
         "repeat a loops=0",
         "finish now",
@@ -266,15 +247,15 @@ def test_texts_are_parsed_as_verbs(verb: NavigationVerb) -> None:
 
 
 @pytest.mark.parametrize(
-    ("request_", "stops"),
+    ("request_", "ends"),
     [
         (NavigationVerb.CANCEL, True),
         (NavigationVerb.PAUSE, True),
         (NavigationVerb.RESUME, False),
         (GoalRequest(NavigationFrame.ODOM, 1.0, 0.0), False),
         (PathRequest(NavigationFrame.ODOM, np.zeros((2, 2))), False),
-        *((RouteRequest(action, "hall"), action is RouteAction.STOP) for action in RouteAction),
+        *((RouteRequest(action, "hall"), action in (RouteAction.FINISH, RouteAction.STOP)) for action in RouteAction),
     ],
 )
-def test_only_cancel_pause_and_the_stop_of_a_route_stop_motion(request_: NavigationRequest, stops: bool) -> None:
-    assert stops_motion(request_) == stops
+def test_only_cancel_pause_and_the_end_of_a_route_are_ends(request_: NavigationRequest, ends: bool) -> None:
+    assert is_end(request_) == ends
