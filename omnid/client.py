@@ -18,8 +18,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from typing import Any, Final, Generic, Literal, Self, TypeVar
+from contextlib import AbstractContextManager, suppress
+from typing import Any, Final, Generic, Literal, TypeVar
 
 import zenoh
 
@@ -65,20 +65,7 @@ _QUALITY: Final[dict[str, Any]] = {
 }
 
 
-class _Closing:
-    """A context manager that calls `close` at the end of the block."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End it; a second call does nothing."""
-
-
-class Subscription(_Closing, Generic[T]):
+class Subscription(AbstractContextManager["Subscription[T]"], Generic[T]):
     """The newest message of one kind; older ones, and what cannot be decoded, are dropped."""
 
     def __init__(self, session: zenoh.Session, key: str, decode: Callable[[bytes, bytes], T]) -> None:
@@ -108,8 +95,11 @@ class Subscription(_Closing, Generic[T]):
             if message is not None:
                 yield message
 
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
-        """End the subscription."""
+        """End the subscription; a second call does nothing."""
         with suppress(zenoh.ZError):
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
 
@@ -129,7 +119,7 @@ def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
     return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
-class Robot(_Closing):
+class Robot(AbstractContextManager["Robot"]):
     """A connection to a robot, direct or through a router; it is ended once.
 
     settings: section [bus] of omnid's configuration, for TLS and passwords, which its file `config` holds.
@@ -148,8 +138,11 @@ class Robot(_Closing):
         self._offset_ns: int | None = None
         self._asked_s = -math.inf
 
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
-        """End the connection."""
+        """End the connection; a second call does nothing."""
         with suppress(zenoh.ZError):
             self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 

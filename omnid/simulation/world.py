@@ -31,6 +31,7 @@ from calib.models.camera import Array
 from calib.typed_toml import bytes_of, convert, table_of
 from calib.validation import MAX_FILE_BYTES
 from drivers.motors.simulated_motor import Pose
+from omnid.core.navigation.surroundings import from_segments_m
 from omnid.errors import OmnidError
 from omnid.simulation.rendering import surfaces
 from omnid.simulation.rendering.surfaces import CEILING_M, Point, Random, Rectangle
@@ -155,11 +156,7 @@ class World:
 
 def distances_m(segments: Array, places: Array) -> Array:
     """Return the distances (M,) [m] of places (M, 2) from the nearest of segments (N, 2, 2); inf without any."""
-    a, along = segments[:, 0], segments[:, 1] - segments[:, 0]
-    to_place = places[:, None] - a
-    share = np.clip((to_place * along).sum(axis=2) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
-    distances = np.linalg.norm(to_place - share[..., None] * along, axis=2)
-    return np.asarray(distances.min(axis=1, initial=np.inf))
+    return np.asarray(from_segments_m(places, segments[:, 0], segments[:, 1]).min(axis=1, initial=np.inf))
 
 
 def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) -> float:

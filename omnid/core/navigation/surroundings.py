@@ -60,7 +60,7 @@ class Surroundings:
         # 1. Obstacles at rest, without moving objects and their trails.
         is_occupied = states == OCCUPIED
         trail = self._state[:, :2] - TRAIL_S * self._state[:, 2:]
-        is_own = _from_segments_m(self._places(is_occupied), trail, self._state[:, :2]) <= self._radius_m + OWN_M
+        is_own = from_segments_m(self._places(is_occupied), trail, self._state[:, :2]) <= self._radius_m + OWN_M
         is_occupied[is_occupied] = ~is_own.any(axis=1)
         self.distance_m = distances_m(is_occupied)  # of each cell to the nearest obstacle
         # 2. Floor that is not known, and patches of floor that were not seen although the base came near.
@@ -133,7 +133,7 @@ class Surroundings:
             movers[:, :2] + np.clip(times_s + shift_s, 0.0, HORIZON_S)[:, None, None] * movers[:, 2:4]
             for shift_s in (-MEETING_S, MEETING_S)
         )
-        return np.asarray(np.minimum(at_rest_m, (_from_segments_m(path, early, late) - movers[:, 4]).min(axis=1)))
+        return np.asarray(np.minimum(at_rest_m, (from_segments_m(path, early, late) - movers[:, 4]).min(axis=1)))
 
     def first_blocked_m(self, path: Array, required_m: float, now_ns: int, speed_mps: float) -> float:
         """Return the way along a path (N, 2) to where an obstacle is nearer than required_m; inf without one.
@@ -174,8 +174,8 @@ def distances_m(flags: Flags) -> Array:
     return np.asarray(cv2.distanceTransform((~flags).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M, "f8")
 
 
-def _from_segments_m(points: Array, begin: Array, end: Array) -> Array:
-    """Return the distances (N, K) of points (N, 2) from segments between (K, 2), or between (N, K, 2)."""
+def from_segments_m(points: Array, begin: Array, end: Array) -> Array:
+    """Return the distances (N, K) [m] of points (N, 2) from segments between (K, 2), or between (N, K, 2)."""
     along, to = end - begin, points[:, None] - begin
     share = np.clip((to * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9), 0.0, 1.0)
     return np.asarray(np.linalg.norm(to - share[..., None] * along, axis=-1))
