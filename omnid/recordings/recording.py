@@ -69,10 +69,8 @@ class RecordingReader:
             found = [name for name in found if name.endswith(f"/{ODOMETRY}")]
         if len(found) != 1:
             wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}" if topic else f"{len(known)} topics of {ODOMETRY_SCHEMA}"
-            raise OmnidError(
-                f"{path}: {wrong}: found {listed(known or topics, 'none')}; name one by --topic, or make a recording "
-                f"by `omnid replay {path} --record out.mcap`"
-            )
+            remedy = "name one by --topic" if known else f"`omnid replay {path} --record out.mcap` makes a recording"
+            raise OmnidError(f"{path}: {wrong}: found {listed(known or topics, 'none')}; {remedy}")
         (self.topic,) = found
         self._prefix = self.topic.rpartition("/")[0]
         self.robot = self._prefix.strip("/") or self.topic

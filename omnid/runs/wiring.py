@@ -54,8 +54,8 @@ def attached_rig(reader: LogReader, log: object) -> Rig:
     attached = reader.attachments().get("rig.toml")
     if attached is None:
         raise OmnidError(
-            f"{log}: no rig.toml is attached to the log; give one with --rig, made by `omnid calibrate "
-            "import camchain.yaml -o rig.toml`"
+            f"{log}: no rig.toml is attached to the log; give one with --rig, made by `omnid calibrate rig`, or "
+            "`omnid calibrate import` from a file of Kalibr or OCamCalib"
         )
     return parse_rig(attached, f"{log}: attached rig.toml")
 

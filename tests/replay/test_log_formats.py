@@ -30,7 +30,7 @@ def entries(scene: Path) -> list[Entry]:
 READ = ("mcap, zstd", "mcap, compressed messages", "db3 of a killed recorder", "bag, bz2", "folder")
 
 
-def test_every_command_reads_every_format_alike(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_every_command_reads_the_same_in_every_format(omnid: Command, tmp_path: Path, scene: Path) -> None:
     logs, trajectories = [scene / "log.mcap"], set()
     for name in READ:
         folder = tmp_path / name
@@ -52,24 +52,19 @@ def test_every_command_reads_every_format_alike(omnid: Command, tmp_path: Path, 
     assert len(trajectories) == 1
 
 
-# What happens to every fourth pair -> exit code and line of a replay.
-LOSSES: dict[str, tuple[Callable[[Image], Image | None], int, str]] = {
-    "an image is missing": (lambda image: None if image.camera == "upper" else image, 1, "6 of 24 pairs are missing"),
-    "an image is cut": (
-        lambda image: replace(image, jpeg=image.jpeg[:3000]) if image.camera == "lower" else image,
-        1,
-        "6 of 24 pairs are missing",
-    ),
+# What happens to the images of every fourth pair.
+LOSSES: dict[str, Callable[[Image], Image | None]] = {
+    "an image is missing": lambda image: None if image.camera == "upper" else image,
+    "an image is cut": lambda image: replace(image, jpeg=image.jpeg[:3000]) if image.camera == "lower" else image,
 }
 
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_the_exit_code_reports_loss(omnid: Command, tmp_path: Path, scene: Path, name: str) -> None:
-    edit, code, line = LOSSES[name]
-    taken = [edit(image) if image.pair % 4 == 1 else image for image in images(scene / "log.mcap")]
+    taken = [LOSSES[name](image) if image.pair % 4 == 1 else image for image in images(scene / "log.mcap")]
     log = save(tmp_path / "log.mcap", [image for image in taken if image is not None])
     result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
-    assert result.code == code and line in result.err
+    assert result.code == 1 and "6 of 24 pairs are missing" in result.err
     assert result.err.count("6 images could not be used") == name.endswith("cut")
 
 

@@ -8,7 +8,7 @@ some of it slows the base down, more stops it. While nothing is unexplained, the
     commanded 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.02 = 0.16 m/s: 0.16 m a second
 
 The seen speed is that along x of the base, so the rig's T_base_rig must be right. Wheels that are not driven may be
-pushed by hand: nothing is compared while the base is commanded to stand.
+pushed by hand: nothing is compared while the base is commanded to be at rest.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class Plausibility:
         self._low_ns: tuple[int, int] | None = None
         self._resets: int | None = None
         self._is_degraded = self._is_reset = self._is_faulty = False
-        self.reason = ""  # the unexplained motion for which the base must stop, until it has stood for REST_S
+        self.reason = ""  # the unexplained motion for which the base must stop, until it was at rest for REST_S
         self.conflict = AGREE  # conflict of the newest pose
 
     @property

@@ -1,4 +1,4 @@
-"""The same content reads alike in every format: frames, order of time, contents; parts, damage and hostile files."""
+"""The same content is read from every format: frames, order of time, contents; parts, damage and hostile files."""
 
 from __future__ import annotations
 
