@@ -122,8 +122,11 @@ def fit_cylinder(
         scale = turn / own_px if math.isfinite(own_px) else 1.0
     elif math.isfinite(own_px):
         turn = 8 * round(scale * own_px / 8)
-    else:
-        raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
+    if not turn:
+        raise CalibError(
+            "rig: a camera does not see the horizon, or as a point; check intrinsics and transforms, or set "
+            "panorama.width_px"
+        )
     width, first = turn, 0
     if span_rad < math.tau:
         step = max(1, round(turn / SECTOR_STEPS))

@@ -27,6 +27,7 @@ TABLE = (
     ("replay {log} --rig {folder}/deep.toml", "expected at most 10000 lines of 256 dots, found 1 of up to 100000 dots"),
     ("replay {log} --rig {folder}/bare.toml", "images are 256x256"),
     ("replay {log} --rig {folder}/narrow.toml", "share no view between -50.0 and 40.0 degrees of elevation"),
+    ("replay {log} --rig {folder}/point.toml", "rig: a camera does not see the horizon, or as a point"),
     ("replay {log} --rig {folder}/huge.toml", "at most 67108864 in all"),
     ("replay {log} --rig {log}", "expected TOML in UTF-8"),
     ("replay {log} --rig {folder}/absent.toml", "`omnid calibrate import` or"),
@@ -66,6 +67,7 @@ def folder(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "deep": f"{'a.' * 100_000}b = 1",
         "bare": "\n\n".join(table for table in other.split("\n\n") if ".mask]" not in table) + "\n",
         "narrow": re.sub(r"fu = -?", "fu = -9000", rig),
+        "point": re.sub(r"xi = .*", "xi = 32767.0", rig),
         "huge": re.sub(r"size = .*", "size = [32767, 32767]", rig),
     }
     for name, content in rigs.items():
