@@ -187,26 +187,31 @@ def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Patte
     assert np.median(base.scan(pairs=12).free_m[AHEAD]) > 0.75 * WALL_M
 
 
-def approached(floor: Pattern, obstacle: Callable[[float], Obstacle]) -> BaseAtRest:
-    """Return a base that has come within 0.55 m of an obstacle ahead, given by its range, and stands."""
-    base = BaseAtRest(floor)
-    for at_m in np.arange(0.0, 1.06, 0.05):
-        base.scan(obstacle(1.6 - at_m), wall_m=4.0 - at_m, at_m=at_m)
-    assert base.scan(obstacle(0.55), pairs=20, at_m=1.05).free_m[AHEAD].max() < 0.8
-    return base
+def approached(base: BaseAtRest, obstacle: Callable[[float], Obstacle], to_m: float) -> float:
+    """Drive a base towards an obstacle ahead, given by its range; return how far it has come."""
+    at_m = 0.0
+    for range_m in np.arange(1.6, to_m, -0.03):
+        at_m = 1.6 - range_m
+        base.scan(obstacle(range_m), wall_m=4.0 - at_m, at_m=at_m)
+    return at_m
 
 
 @pytest.mark.parametrize("floor", [worn, stains])
 def test_a_way_is_free_when_a_person_nearer_than_the_floor_in_view_has_left(floor: Pattern) -> None:
-    base = approached(floor, lambda range_m: Pole(range_m, 0.4, 60.0))
-    assert base.scan(pairs=40, at_m=1.05).free_m[AHEAD].min() > 1.5
+    base = BaseAtRest(floor)
+    at_m = approached(base, lambda range_m: Pole(range_m, 0.4, 60.0), 0.55)
+    assert base.scan(Pole(1.6 - at_m, 0.4, 60.0), pairs=20, at_m=at_m).free_m[AHEAD].max() < 0.7
+    assert base.scan(pairs=40, at_m=at_m).free_m[AHEAD].min() > 1.5
 
 
 @pytest.mark.hazard("H19")
 @pytest.mark.parametrize("floor", [worn, stains])
 def test_something_low_stays_where_it_is_too_near_to_be_seen(floor: Pattern) -> None:
-    base = approached(floor, lambda range_m: Block(range_m, 0.3, 0.15))
-    assert base.scan(Block(0.55, 0.3, 0.15), pairs=80, at_m=1.05).free_m[AHEAD].max() < 0.8
+    """It hides the nearest floor in view on the way, but no longer when the base is near: it has not left."""
+    base = BaseAtRest(floor)
+    at_m = approached(base, lambda range_m: Block(range_m, 0.3, 0.3, pattern=stains), 0.25)
+    scan = base.scan(Block(1.6 - at_m, 0.3, 0.3, pattern=stains), pairs=40, at_m=at_m)
+    assert scan.free_m[AHEAD].max() < 0.35
 
 
 @pytest.mark.hazard("H17")
