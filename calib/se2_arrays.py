@@ -1,4 +1,4 @@
-"""Poses on the floor (x, y, yaw) [m, m, rad] in arrays (3,) or (N, 3), and transforms; single floats: `se2.py`."""
+"""Poses on the floor (x, y, yaw) [m, m, rad] in arrays (3,) or (N, 3), transforms, and distances; floats: `se2.py`."""
 
 from __future__ import annotations
 
@@ -46,3 +46,10 @@ def relative(a: Array, b: Array) -> Array:
 def predicted(pose: Array, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> Array:
     """Return the pose (3,) after a time at constant speeds."""
     return np.array(composed_pose(Pose2(*pose.tolist()), along_arc(velocity_mps, yaw_rate_radps, duration_s)))
+
+
+def from_segments_m(points: Array, begin: Array, end: Array) -> Array:
+    """Return the distances (N, K) [m] of points (N, 2) from segments between (K, 2), or between (N, K, 2)."""
+    along, to = end - begin, points[:, None] - begin
+    share = np.clip((to * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(to - share[..., None] * along, axis=-1))

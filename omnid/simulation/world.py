@@ -28,10 +28,10 @@ from msgspec import Meta, Struct
 
 from calib import se3
 from calib.models.camera import Array
+from calib.se2_arrays import from_segments_m
 from calib.typed_toml import bytes_of, convert, table_of
 from calib.validation import MAX_FILE_BYTES
 from drivers.motors.simulated_motor import Pose
-from omnid.core.navigation.surroundings import from_segments_m
 from omnid.errors import OmnidError
 from omnid.simulation.rendering import surfaces
 from omnid.simulation.rendering.surfaces import CEILING_M, Point, Random, Rectangle

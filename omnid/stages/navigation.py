@@ -25,7 +25,7 @@ from omnid.core.navigation.requests import (
     RouteAction,
     RouteRequest,
     TaughtRoute,
-    is_end,
+    begins_nothing,
 )
 from omnid.core.navigation.route import ENTRY_M, KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
@@ -172,7 +172,7 @@ class NavigationStage:
     def _execute(self, command: NavigationCommand) -> None:
         """Execute a request. Raise OmnidError with the reason to refuse it."""
         request, navigator = command.request, self._navigator
-        if not is_end(request) and command.stop_count < self._wheels.stop_count:
+        if not begins_nothing(request) and command.stop_count < self._wheels.stop_count:
             raise OmnidError("a stop or a fault has come since: ask again")
         match request:
             case NavigationVerb.CANCEL:

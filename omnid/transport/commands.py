@@ -246,7 +246,7 @@ class CommandReceiver:
         request that waited in a network must not start a drive minutes later.
         """
         request, stamp_ns = _navigation_request(message.topic, message.payload)
-        if not requests.is_end(request):
+        if not requests.begins_nothing(request):
             self._freshness.require(message, arrival_ns, stamp_ns)
         self.requests.accepted += 1
         stamp_ns, stops = stamp_ns or message.sent_ns, self._controller.statistics.state.stop_count

@@ -24,7 +24,7 @@ from starlette.routing import BaseRoute, Route
 
 from omnid.client import ANSWER_S, Answer, Driver, Robot
 from omnid.core.control.heading_controller import VelocityLimits
-from omnid.core.navigation.requests import NavigationRequest, is_end, navigation_verb, route_request
+from omnid.core.navigation.requests import NavigationRequest, begins_nothing, navigation_verb, route_request
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import stop
 from omnid.monitor.teleop import Stick, limits_of
@@ -121,7 +121,7 @@ class RobotPage:
         """Pass on a request by the text of cmd/route or cmd/navigation, such as "repeat NAME stamp=STAMP"."""
         found = _STAMPED.fullmatch(await text_of(asked))
         text, stamp = ("", None) if found is None else found.groups()
-        if not is_end(parse(text)):
+        if not begins_nothing(parse(text)):
             stamp_of(stamp or "")
         return await self._ask(kind, lambda driver: ask(driver, text))
 

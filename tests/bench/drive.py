@@ -35,13 +35,13 @@ from omnid.core.navigation.requests import (
     RouteAction,
     RouteRequest,
 )
-from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.rendering.surfaces import poster
 from omnid.simulation.robot import START_NS, make_robot
 from omnid.simulation.world import Walker, World, distances_m, load_world
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation.disturbed import Fault, Slip, disturbed, least_clearance_m, simulate
+from tests.simulation.lockstep import Moment, Request, SimulatedRun
 
 Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
 ANSWER_S = 0.5  # after a request, within which no end of its drive is looked for

@@ -20,9 +20,9 @@ from calib.se2_arrays import composed, planar, relative
 from omnid.config import load_config
 from omnid.core.obstacles.grid import CELL_M, FREE, OCCUPIED, FloorGrid
 from omnid.core.types.panorama import PaddedPanorama
-from omnid.simulation.lockstep import Moment, Request
 from tests.bench.obstacles import Array, Asker, Planned, prepared, settings_for
 from tests.simulation.disturbed import simulate
+from tests.simulation.lockstep import Moment, Request
 
 EVERY: Final = 10  # scans from one picture to the next
 FRAME_MS: Final = 250

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
-from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.world import Walkers, clearance_m
@@ -38,6 +37,7 @@ from tests.bench.results import ROOT, ResultTable, columns, commit
 from tests.simulation.disturbed import least_clearance_m, simulate
 from tests.simulation.harmless_worlds import FLOORS, Trial
 from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, trial
+from tests.simulation.lockstep import Moment, Request, SimulatedRun
 from tests.simulation.photographs import with_photographs
 
 Array = NDArray[np.float64]

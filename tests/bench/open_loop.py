@@ -29,12 +29,12 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.grid import FloorGrid
-from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.robot import START_NS
 from omnid.simulation.world import Walkers, clearance_m
 from tests.bench.obstacles import Planned, prepared, settings_for
 from tests.bench.results import ResultTable, columns
 from tests.simulation.disturbed import simulate
+from tests.simulation.lockstep import Moment, Request
 
 Array = NDArray[np.float64]
 EVERY: Final = 3  # pair that is stored

@@ -19,13 +19,13 @@ from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.simulated_motor import Pose, SimulatedMotor
 from omnid.config import Config
-from omnid.simulation import lockstep
-from omnid.simulation.lockstep import Drive, SimulatedRun
 from omnid.simulation.rendering.ray_caster import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedCameras, SimulatedRobot, Vehicle
 from omnid.simulation.world import Walkers, World
+from tests.simulation import lockstep
 from tests.simulation.disturbances import Mirror, MountedSensor, jpeg, seen_part
+from tests.simulation.lockstep import Drive, SimulatedRun
 
 HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor
 WHEEL_M: Final = 0.05  # A wheel rounds off the heights within this distance.

@@ -116,7 +116,7 @@ class NavigationCommand(NamedTuple):
     stop_count: int = 0
 
 
-def is_end(request: NavigationRequest) -> bool:
+def begins_nothing(request: NavigationRequest) -> bool:
     """True if a request ends or pauses what is under way, and begins no motion."""
     if isinstance(request, RouteRequest):
         return request.action in (RouteAction.FINISH, RouteAction.STOP)

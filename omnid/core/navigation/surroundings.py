@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.se2_arrays import from_segments_m
 from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
 from omnid.core.navigation.path import ways_m
 from omnid.core.obstacles.grid import CELL_M, OCCUPIED, SQUARE, UNKNOWN, FloorGrid
@@ -172,10 +173,3 @@ def distances_m(flags: Flags) -> Array:
     if not flags.any():
         return np.full(flags.shape, FAR_M)
     return np.asarray(cv2.distanceTransform((~flags).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M, "f8")
-
-
-def from_segments_m(points: Array, begin: Array, end: Array) -> Array:
-    """Return the distances (N, K) [m] of points (N, 2) from segments between (K, 2), or between (N, K, 2)."""
-    along, to = end - begin, points[:, None] - begin
-    share = np.clip((to * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), 1e-9), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(to - share[..., None] * along, axis=-1))

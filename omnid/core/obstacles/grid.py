@@ -52,7 +52,7 @@ class GridParameters:
     same_place: float = 0.9  # rho: correlation of the errors of pairs from one place, 0 after the way of a cell
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
-    rest_m: float = 0.01  # by which a base at rest seems to move
+    rest_m: float = 0.01  # by which a base at rest seems to move; half and twice as much change nothing
     outline_cells: int = 2  # around what has left, by which rays are wider than its outline
     strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
@@ -67,7 +67,7 @@ class GridParameters:
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
     surface_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
-    hanging_most: float = 0.3  # most that is kept of it, so that what has left is forgotten within some views
+    hanging_most: float = 0.3  # most of it, by which it is an obstacle; more would only be forgotten later
     hanging_least: float = 0.08  # mean from which something hangs there,
     hanging_weight: float = 30.0  # and its log-odds by this mean
     arrival_surface: float = 0.07  # mean from which something that hangs has come onto floor that was free
@@ -288,17 +288,19 @@ class ObstacleGrid:
         return _without_specks(possible)
 
     def _release(self, place_m: Array, hidden: Flags, past: Flags, views: np.float32) -> None:
-        """Release cells (SIDE, SIDE) too near to be seen whose obstacle hid the nearest floor in view from the place
-        (2,) of a base at rest, and does so no longer.
+        """Release cells (SIDE, SIDE) that hid the nearest floor in view, where a base at rest sees that floor again.
 
-        So a person or a trolley has left, with the cells around its outline. What is low hides that floor from the same
-        place, or not. views: of a pair.
+        So a person or a trolley that was too near to be seen has left. A base that drives learns nothing of it: a low
+        box hides that floor on the way, and no longer when the base is near. place_m (2,): of the base. views: by which
+        the pair counts.
         """
         p, hiding = self._p, self._hiding
+        # 1. Views from this place: hidden ones count twice, and after p.views of them as many past it are needed.
         if math.dist(place_m, self._rest_m) > p.rest_m:
             self._rest_m, hiding[:] = place_m, 0
         hiding += np.where(hidden, 2 * views, np.where(past, -views, 0))
         has_left = past & (hiding < p.views) & (hiding + views >= p.views)
+        # 2. What has left takes the cells around its outline along.
         if has_left.any():
             around = cv2.dilate(has_left.view(np.uint8), SQUARE, iterations=p.outline_cells) > 0
             released = around & past & (self._things() > 1 / (1 + math.exp(-p.prior)))

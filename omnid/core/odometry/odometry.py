@@ -298,7 +298,7 @@ class VisualOdometry:
 
     @property
     def _was_refused(self) -> bool:
-        """True if the last frame was."""
+        """True if the pose of the last frame was predicted, as none was found or accepted."""
         return self._motion.since_found_s > 0
 
     @property

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from drivers.frame import Camera, Frame
 from omnid.config import load_config
 from omnid.core.control.collision_monitor import SCAN_STALE, UNOBSERVED, UNSEEN
-from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.robot import make_robot
 from tests.bench.obstacles import ahead
 from tests.bench.results import ResultTable, columns
 from tests.simulation.disturbed import Fault, Tamper, least_clearance_m, simulate
 from tests.simulation.hazard_worlds import trial
+from tests.simulation.lockstep import Moment, Request
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]

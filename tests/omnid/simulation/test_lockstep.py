@@ -26,8 +26,6 @@ from omnid.core.mapping.scan_grid import FREE, UNKNOWN
 from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
 from omnid.formats.tum import read_tum
-from omnid.simulation import lockstep
-from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World, load_world
 from omnid.transport.session import BusConfig
@@ -37,7 +35,9 @@ from tests.bench.obstacles import ahead
 from tests.busy import stopped_by_turns
 from tests.ports import free_port
 from tests.replay.live import started
+from tests.simulation import lockstep
 from tests.simulation.disturbed import Fault, Tamper, least_clearance_m, simulate
+from tests.simulation.lockstep import Moment, Request, SimulatedRun
 from tests.waiting import wait_until
 
 SIZE = 160
