@@ -21,7 +21,7 @@ from omnid.core.navigation.requests import (
     PathRequest,
     RouteAction,
     RouteRequest,
-    is_end,
+    begins_nothing,
     navigation_verb,
     route_request,
 )
@@ -258,4 +258,4 @@ def test_texts_are_parsed_as_verbs(verb: NavigationVerb) -> None:
     ],
 )
 def test_only_cancel_pause_and_the_end_of_a_route_are_ends(request_: NavigationRequest, ends: bool) -> None:
-    assert is_end(request_) == ends
+    assert begins_nothing(request_) == ends
